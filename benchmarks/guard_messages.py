@@ -23,7 +23,7 @@ from rosbags.typesys import get_types_from_msg
 
 from appliance.channel.admin import MonitorsWanted
 from appliance.features.guards.presets import PRESETS, Guard, Preset, text_of
-from appliance.features.guards.released import FOLDER, released
+from appliance.features.guards.released import FOLDER, released_preset
 from benchmarks.cold import realtime
 from benchmarks.relay_throughput import HERE
 from rosmop.run.engine import MonitorSet
@@ -209,7 +209,7 @@ def overhead() -> float:
 
 def last_release(name: str) -> Preset | None:
     versions = [int(path.stem.rpartition("-")[2]) for path in FOLDER.glob(f"{name}-*.rv")]
-    return released(name, max(versions)) if versions else None
+    return released_preset(name, max(versions)) if versions else None
 
 
 def deployed(rays: int, scans: int) -> int:

@@ -29,7 +29,7 @@ from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 
 MESSAGES = Messages()
-KNOWN = standard_definitions().extended(Definitions.from_files(DEFINITIONS))
+KNOWN = standard_definitions().merge(Definitions.from_files(DEFINITIONS))
 SECOND = 10**9
 JITTER = 0.004  # seconds: the usual lateness of a reception
 NOISE: Mapping[str, Mapping[str, float]] = {

@@ -86,7 +86,7 @@ class Statuses:
         began = time.monotonic()
         try:
             answer = AdminSocket(state).ask(standby_requests.StandbyWanted())
-            text = _judgement(answer.given()) if answer.ok else answer.error
+            text = _judgement(answer.unwrap()) if answer.ok else answer.error
         except NotRunningError as error:
             text = str(error).partition(": ")[2]
         self.said[name], self.seconds[name] = text, time.monotonic() - began

@@ -146,7 +146,7 @@ def _tables() -> Iterator[str]:
     yield _table(
         "Margins: the honest use that comes closest",
         ("resource", "use", "it needs", "allowed", "times", "beyond it"),
-        lambda row: _margin(row) if allowed(row) < 2 * row.margin.needs else None,
+        lambda row: _margin(row) if bound_of(row) < 2 * row.margin.needs else None,
     )
 
 
@@ -154,7 +154,7 @@ def _short(thing: str) -> str:
     return re.split(r": | \(|; |, (?:beyond|in percent|including|also|divided) ", thing)[0]
 
 
-def allowed(row: QuotaRow) -> int:
+def bound_of(row: QuotaRow) -> int:
     """Return the bound that the honest use of a row meets first."""
     bounds = row.bounds
     match row.margin.of:
@@ -169,7 +169,7 @@ def allowed(row: QuotaRow) -> int:
 
 def _margin(row: QuotaRow) -> tuple[str, ...]:
     use, needs, _, beyond = row.margin
-    return _short(row.thing), use, f"{needs:,}", f"{allowed(row):,}", f"{allowed(row) / needs:.1f}", beyond
+    return _short(row.thing), use, f"{needs:,}", f"{bound_of(row):,}", f"{bound_of(row) / needs:.1f}", beyond
 
 
 def _table(title: str, columns: tuple[str, ...], cells: Callable[[QuotaRow], tuple[str, ...] | None]) -> str:
@@ -362,7 +362,7 @@ def uses() -> Iterator[EventUse]:
     return (use for module in _modules() for use in module.uses)
 
 
-def written() -> frozenset[str]:
+def recorded_events() -> frozenset[str]:
     """Return the events that the code records: by a literal name, or by a name from a table of the same module.
 
     A name that is only compared, or only printed, records nothing.
@@ -393,13 +393,13 @@ def _prints(node: ast.Call) -> bool:
     return isinstance(owner, ast.Name) and owner.id in ("log", "_log")
 
 
-def _called(node: ast.Call) -> str:
+def _called_name(node: ast.Call) -> str:
     return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
 
 
 def _event(node: ast.Call) -> ast.expr | None:
     """Return the expression for the event of a call that records one."""
-    called = _called(node)
+    called = _called_name(node)
     named = {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg is not None}
     if called in ("AuditRecord", "WriteRecord") and "event" in named:
         return named["event"]
@@ -409,7 +409,7 @@ def _event(node: ast.Call) -> ast.expr | None:
 
 def _helper(node: ast.Call, scope: _Scope) -> Iterator[_Helper]:
     """Yield the function of a call that takes the event, or further fields, from its own caller."""
-    event = _event(node) if _called(node) == "happened" else None
+    event = _event(node) if _called_name(node) == "happened" else None
     if scope is not None and event is not None:
         fields = tuple(_fields(node, scope))
         parameters = [one.arg for one in scope.args.args if one.arg != "self"]
@@ -484,7 +484,7 @@ def _events_of(event: ast.expr, scope: _Scope, module: Sequence[ast.AST]) -> Ite
 def _use(
     node: ast.Call, place: str, scope: _Scope, helpers: Mapping[str, _Helper], module: Sequence[ast.AST]
 ) -> Iterator[EventUse]:
-    called, event = _called(node), _event(node)
+    called, event = _called_name(node), _event(node)
     named = {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg is not None}
     fields = [*_fields(node, scope)] if called == "happened" else [_UNKNOWN]
     helper = helpers.get(called)
@@ -606,7 +606,7 @@ def present(page: str) -> str:
     return path.read_text(encoding="utf-8") if path.exists() else ""
 
 
-def generated(page: str) -> str:
+def generate(page: str) -> str:
     """Return the text that a page should have; between its marks, if it has any, and unchanged elsewhere."""
     before, begin, rest = present(page).partition(_BEGIN)
     if not begin:
@@ -618,7 +618,7 @@ def generated(page: str) -> str:
 if __name__ == "__main__":
     # A page that cannot be generated keeps its text, unlike with `> page`.
     try:
-        texts = {page: generated(page) for page in PAGES}
+        texts = {page: generate(page) for page in PAGES}
     except BuildError as error:
         sys.exit(f"make pages: {error}")
     for changed, text in texts.items():

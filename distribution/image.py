@@ -170,7 +170,7 @@ class Blob:
     digest: str
     size: int
 
-    def described(self, media_type: str) -> dict[str, Any]:
+    def descriptor(self, media_type: str) -> dict[str, Any]:
         return {"mediaType": media_type, "digest": f"sha256:{self.digest}", "size": self.size}
 
 
@@ -227,7 +227,7 @@ def _rewrite(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
     layers.append(_layer(work / "added", _files(added, moment)))
     image = ROOT / "dist" / f"rosrv-image_{__version__}_{architecture}.tar"
     image.parent.mkdir(exist_ok=True)
-    _write_oci(image, _settled(config, layers, moment), layers, moment)
+    _write_oci(image, _settle(config, layers, moment), layers, moment)
     listed = image.with_suffix(".cdx.json")
     listed.write_text(sbom)
     return image, listed
@@ -277,7 +277,7 @@ def _blob(path: Path) -> Blob:
         return Blob(path, hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
 
 
-def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
+def _settle(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
     """Return the image's configuration without the values that depend on the building engine."""
     created = datetime.fromtimestamp(moment, UTC).isoformat().replace("+00:00", "Z")
     history = [{**step, "created": created} for step in config["history"]]
@@ -319,11 +319,11 @@ def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: 
     manifest = document("manifest", {
         "schemaVersion": 2,
         "mediaType": "application/vnd.oci.image.manifest.v1+json",
-        "config": configuration.described("application/vnd.oci.image.config.v1+json"),
-        "layers": [layer.described(_LAYER) for layer in layers],
+        "config": configuration.descriptor("application/vnd.oci.image.config.v1+json"),
+        "layers": [layer.descriptor(_LAYER) for layer in layers],
         "annotations": annotations,
     })  # fmt: skip
-    entry = manifest.described("application/vnd.oci.image.manifest.v1+json")
+    entry = manifest.descriptor("application/vnd.oci.image.manifest.v1+json")
     entry["annotations"] = {
         "io.containerd.image.name": f"docker.io/{NAME}",
         "org.opencontainers.image.ref.name": __version__,

@@ -19,7 +19,7 @@ from appliance.features.guards.evidence import (
 )
 from appliance.features.guards.presets import PRESETS
 from distribution.checkout import BuildError
-from lab.closed_loop.results import Row, Rows, parsed, present_digests
+from lab.closed_loop.results import Row, Rows, parse_rows, present_digests
 from lab.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS, at_most
 
 ROOT = Path(__file__).parents[1]
@@ -145,7 +145,7 @@ def _proofs() -> dict[str, tuple[str, str]]:
 
 
 def _results() -> Rows:
-    return parsed(json.loads(RESULTS.read_text(encoding="utf-8"))) if RESULTS.exists() else {}
+    return parse_rows(json.loads(RESULTS.read_text(encoding="utf-8"))) if RESULTS.exists() else {}
 
 
 def _left_out(name: str) -> str:

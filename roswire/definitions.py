@@ -83,7 +83,7 @@ class Definitions:
             messages[section] = parse_message(section, body, name, line)
         return cls(messages)
 
-    def extended(self, other: "Definitions") -> "Definitions":
+    def merge(self, other: "Definitions") -> "Definitions":
         """Return the definitions of both. A type of `other` replaces one of the same name."""
         return Definitions(self._messages | other._messages, self._services | other._services)
 

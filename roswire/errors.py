@@ -39,5 +39,5 @@ class DefinitionError(PeerError):
         self.line = line
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     return ascii(text if len(text) <= 80 else text[:80] + "...")

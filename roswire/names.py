@@ -13,7 +13,7 @@ Invariants:
 
 import re
 
-from roswire.errors import InvalidNameError, quoted
+from roswire.errors import InvalidNameError, quote
 
 MAX_NAME_LENGTH = 1024
 """A generous limit: names on robots are shorter than a quarter of it."""
@@ -38,7 +38,7 @@ def resolve(name: str, caller_id: str) -> str:
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
-        raise InvalidNameError(f"{quoted(name)} is the global namespace: give the name of something in it")
+        raise InvalidNameError(f"{quote(name)} is the global namespace: give the name of something in it")
     return resolved
 
 
@@ -87,7 +87,7 @@ def namespace(name: str) -> str:
     return name[: name.rstrip("/").rfind("/") + 1] or "/"
 
 
-def searched(key: str, caller_id: str) -> list[str]:
+def candidate_keys(key: str, caller_id: str) -> list[str]:
     """Return the keys that `searchParam` tries, from the caller's namespace upwards."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
@@ -114,9 +114,7 @@ def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
             caller_id = canonical_tool_id(caller_id)
         resolved = f"{caller_id}/{name[1:]}" if first == "~" else namespace(caller_id) + name
         if len(resolved) > MAX_NAME_LENGTH or grammar.match(resolved) is None:
-            raise InvalidNameError(
-                f"name {quoted(name)} of {quoted(caller_id)}: {_refusal(resolved, grammar)}"
-            )
+            raise InvalidNameError(f"name {quote(name)} of {quote(caller_id)}: {_refusal(resolved, grammar)}")
     if "//" in resolved:
         resolved = _SLASHES.sub("/", resolved)
     return resolved.rstrip("/") or "/"
@@ -130,7 +128,7 @@ def _canonical_id(caller_id: str, grammar: re.Pattern[str]) -> str:
         if grammar.match(folded) is not None:
             return folded
     raise InvalidNameError(
-        f"caller_id {quoted(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
+        f"caller_id {quote(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
         f"with letters, digits and '_', at most {MAX_NAME_LENGTH} characters"
     )
 
@@ -139,7 +137,7 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
     if not name:
         return "empty name: a ROS name has at least one character"
     if len(name) > MAX_NAME_LENGTH:
-        return f"name {quoted(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
+        return f"name {quote(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
     for position, character in enumerate(name):
         if character != "~" and grammar.match(f"/a{character}a") is None:
             allowed = (
@@ -147,7 +145,9 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
                 if grammar is _PARAMETER
                 else "letters, digits, '_', '/'"
             )
-            return f"name {quoted(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
+            return f"name {quote(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
     if grammar is _PARAMETER:
-        return f"name {quoted(name)}: '~' is only allowed first, and no part of a key starts or ends with a space"
-    return f"name {quoted(name)}: a ROS name starts with a letter, '/' or '~', and '~' is allowed only there"
+        return (
+            f"name {quote(name)}: '~' is only allowed first, and no part of a key starts or ends with a space"
+        )
+    return f"name {quote(name)}: a ROS name starts with a letter, '/' or '~', and '~' is allowed only there"

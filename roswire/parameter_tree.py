@@ -57,7 +57,7 @@ def same_value(one: Value, other: Value) -> bool:
     return type(one) is type(other) and one == other
 
 
-def merged(before: Mapping[str, Value], there: Mapping[str, Value], here: Mapping[str, Value]) -> Tree:
+def merge(before: Mapping[str, Value], there: Mapping[str, Value], here: Mapping[str, Value]) -> Tree:
     """Return the tree `here` with what changed `there` since `before`, except what has also changed here."""
     result = dict(here)
     for name in {**before, **there}:
@@ -65,7 +65,7 @@ def merged(before: Mapping[str, Value], there: Mapping[str, Value], here: Mappin
         if same_value(was, new):
             continue
         if isinstance(new, dict) and isinstance(own, dict):
-            result[name] = merged(was if isinstance(was, dict) else {}, new, own)
+            result[name] = merge(was if isinstance(was, dict) else {}, new, own)
         elif same_value(was, own):
             result.pop(name, None)
             if name in there:

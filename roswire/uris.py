@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from roswire.errors import InvalidUriError, quoted
+from roswire.errors import InvalidUriError, quote
 
 MAX_URI_LENGTH = 1024
 
@@ -41,7 +41,7 @@ def parse_service_uri(text: str) -> NodeUri:
     """Parse the URI of a service. Raise `InvalidUriError`, including for a URI with a path."""
     uri = _parse(text, "rosrpc", "service", "rosrpc://host:port")
     if uri.path not in ("", "/"):
-        raise InvalidUriError(f"service URI {quoted(text)} has a path; write rosrpc://host:port")
+        raise InvalidUriError(f"service URI {quote(text)} has a path; write rosrpc://host:port")
     return NodeUri(uri.scheme, uri.host, uri.port, "")
 
 
@@ -58,16 +58,16 @@ def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
         raise InvalidUriError(f"{what} URI of {len(text)} characters; at most {MAX_URI_LENGTH} are allowed")
     found = _URI.match(text)
     if found is None:
-        raise InvalidUriError(f"{what} URI {quoted(text)} {_complaint(text)}; write {form}")
+        raise InvalidUriError(f"{what} URI {quote(text)} {_complaint(text)}; write {form}")
     if found["scheme"].lower() != scheme:
         raise InvalidUriError(
-            f"{what} URI {quoted(text)} has the scheme {quoted(found['scheme'])}; write {form}"
+            f"{what} URI {quote(text)} has the scheme {quote(found['scheme'])}; write {form}"
         )
     if found["port"] is None:
-        raise InvalidUriError(f"{what} URI {quoted(text)} has no port; write {form}")
+        raise InvalidUriError(f"{what} URI {quote(text)} has no port; write {form}")
     port = int(found["port"][1:])
     if not 1 <= port <= 65535:
-        raise InvalidUriError(f"{what} URI {quoted(text)} has port {port}; a port is between 1 and 65535")
+        raise InvalidUriError(f"{what} URI {quote(text)} has port {port}; a port is between 1 and 65535")
     return NodeUri(
         scheme, _host(found["host"], text, what), port, found["path"] or ("/" if scheme == "http" else "")
     )
@@ -79,7 +79,7 @@ def _host(host: str, text: str, what: str) -> str:
     try:
         return str(ipaddress.IPv6Address(host.strip("[]")))
     except ValueError:
-        raise InvalidUriError(f"{what} URI {quoted(text)} has no valid IPv6 address as its host") from None
+        raise InvalidUriError(f"{what} URI {quote(text)} has no valid IPv6 address as its host") from None
 
 
 def _complaint(text: str) -> str:

@@ -156,7 +156,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path, seen: Seen) -> l
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
     """Yield the log first; the others are listed after it is copied, so the key for its signatures exists by then."""
-    log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
+    log = open_file(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
     if log is not None:
         yield AUDIT_LOG, log
     names = [
@@ -172,7 +172,7 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
             " origin, and remove them"
         )
     for name in names:
-        descriptor = opened(state, name) if name != AUDIT_LOG else None
+        descriptor = open_file(state, name) if name != AUDIT_LOG else None
         if descriptor is not None:
             yield name, descriptor
 
@@ -187,7 +187,7 @@ def _names(state: Path, part: str) -> Iterator[str]:
                 yield kept
 
 
-def opened(state: Path, name: str) -> int | None:
+def open_file(state: Path, name: str) -> int | None:
     """Open a file of the state, following no link; return None if it is not a regular file.
 
     Raises `BackupError` for a wrong owner.

@@ -6,7 +6,7 @@
    time. A system clock that is behind adds nothing until someone corrects it. If it is still behind at a later start,
    it may have been ahead before: the time since its latest reading counts, up to `_AT_ONCE`.
 3. The state is saved every `_SAVE`; time since the last save counts as time off.
-4. When a long gap is added later, `dated` also adds it to the dates of data that was made in between.
+4. When a long gap is added later, `true_date` also adds it to the dates of data that was made in between.
 """
 
 from collections.abc import Callable
@@ -99,7 +99,7 @@ class AgeClock:
                 write_whole(self._path, msgspec.json.encode(kept), 0o600)
         return kept.lived + kept.credited
 
-    def dated(self, date: int) -> int:
+    def true_date(self, date: int) -> int:
         """Return when data was made that got this date by the clock."""
         for jump in self._kept.jumps:
             if jump.first <= date <= jump.last:
@@ -110,7 +110,7 @@ class AgeClock:
         """Return the latest time that it may be: with the time off that does not count yet."""
         return self() + max(0, self._kept.step)
 
-    def uncounted(self, date: int) -> int:
+    def uncounted_time(self, date: int) -> int:
         """Return the time off after this date by the clock that does not count yet, although it may be real."""
         return max(0, self._kept.step) if date < self._kept.since + self._kept.credited else 0
 

@@ -35,7 +35,7 @@ def addresses_of(names: Iterable[str], start: Starter = subprocess.Popen) -> dic
     name, then the given order.
     """
     wanted = dict.fromkeys(names)
-    listed = _listed()
+    listed = _read_names()
     found = {name: listed.get(name.lower(), []) for name in wanted}
     until = clock.now() + _WHOLE_SECONDS
 
@@ -61,7 +61,7 @@ def addresses_of(names: Iterable[str], start: Starter = subprocess.Popen) -> dic
     return found
 
 
-def _listed() -> dict[str, list[str]]:
+def _read_names() -> dict[str, list[str]]:
     """Return the addresses of the names in /etc/hosts; nothing if it cannot be read."""
     found: dict[str, list[str]] = {}
     with suppress(OSError), _FILE.open("rb") as file:

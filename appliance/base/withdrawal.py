@@ -33,7 +33,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 
 @contextlib.contextmanager
-def awaited(given_up: Callable[[], bool], host: str = "") -> Iterator[None]:
+def withdrawable(given_up: Callable[[], bool], host: str = "") -> Iterator[None]:
     """Run the block as an order that its client can give up; `given_up()` returns whether it has."""
     order = _Order(given_up, host)
     before = _PRESENT.set(order)

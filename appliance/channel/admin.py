@@ -447,7 +447,7 @@ class AdminAnswer(msgspec.Struct, Generic[A_co], frozen=True):
     tag: str = ""
     active: str = ""
 
-    def given(self) -> A_co:
+    def unwrap(self) -> A_co:
         assert self.body is not None  # noqa: S101  it has one
         return self.body
 

@@ -47,7 +47,7 @@ def is_dry_run(query: str) -> bool:
     return parse_qs(query, keep_blank_values=True).get("dry_run", ["0"])[-1].lower() not in _NO
 
 
-def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[object]:
+def order_of(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[object]:
     """Return the order in a request; with `dry_run`, it must be a dry run. Raises `NoOrderError`."""
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:

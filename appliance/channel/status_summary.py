@@ -18,7 +18,7 @@ def no_relay(presence: str) -> str | None:
     return f"of the relay processes {presence}: their topics and services carry nothing"
 
 
-def unserved(status: Status) -> str | None:
+def why_unserved(status: Status) -> str | None:
     if probe_failed(status):
         return f"the ROS master is not hidden: {status.probe}"
     if status.audit.failed and status.audit.on_failure == "deny":

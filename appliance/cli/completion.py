@@ -21,7 +21,7 @@ def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Comple
         except (NotRunningError, OSError):
             return []
         said = context.params.get("names") or ()
-        names = of(answer.given()) if answer.ok else ()
+        names = of(answer.unwrap()) if answer.ok else ()
         return sorted({name for name in names if name.startswith(incomplete) and name not in said})
 
     return complete

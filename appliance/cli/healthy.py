@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from appliance.channel.admin import StatusWanted
-from appliance.channel.status_summary import unserved
+from appliance.channel.status_summary import why_unserved
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 
 _STATE = "/var/lib/rosrv"  # the default of the configuration's key `state`
@@ -22,7 +22,7 @@ def main() -> None:
         answer = AdminSocket(state, _SECONDS).ask(StatusWanted())
         if answer.trouble == "standby":
             return
-        reason = unserved(answer.given()) if answer.ok else answer.error
+        reason = why_unserved(answer.unwrap()) if answer.ok else answer.error
     except NotRunningError as error:
         reason = f"the appliance does not answer: {error}"
     if reason is not None:

@@ -11,8 +11,8 @@ from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
-from appliance.cli.verb_table import Group, Verb, Verbs, joined
-from rosmop.tool.terminal import flowed
+from appliance.cli.verb_table import Group, Verb, Verbs, merge
+from rosmop.tool.terminal import reflow
 
 if TYPE_CHECKING:
     from typer._click import Command, Context, Parameter
@@ -96,7 +96,7 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
 
         @functools.cached_property
         def all_commands(self) -> dict[str, TyperCommand | TyperGroup]:
-            own, table = self.own_commands, joined(verbs, *further())
+            own, table = self.own_commands, merge(verbs, *further())
             found = {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
             if not panels:
                 return found
@@ -115,7 +115,7 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
         ) -> "tuple[str | None, Command | None, list[str]]":
             known = args[0] in self.own_commands or args[0][:1] == "-" or args[0] in self.commands
             if not known and not ctx.resilient_parsing:
-                raise _unknown(args[0], ctx, joined(verbs, *further()))
+                raise _unknown(args[0], ctx, merge(verbs, *further()))
             return super().resolve_command(ctx, args)
 
     return _Lazy
@@ -163,7 +163,7 @@ class _Deferred(TyperCommand):
     def make_context(
         self, info_name: str | None, args: list[str], parent: "Context | None" = None, **extra: object
     ) -> "Context":
-        command = loaded(self._verb, str(self.name))
+        command = load_command(self._verb, str(self.name))
         try:
             return command.make_context(info_name, args, parent, **extra)
         except typer.BadParameter as error:
@@ -174,13 +174,13 @@ class _Deferred(TyperCommand):
             raise
 
 
-def loaded(verb: Verb, name: str) -> "Command":
+def load_command(verb: Verb, name: str) -> "Command":
     found = pkgutil.resolve_name(verb.path)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function, kind = (
         (found.function, found.command) if isinstance(found, GroupedVerb) else (found, TyperCommand)
     )
-    words = flowed("\n\n".join(filter(None, (verb.first, inspect.getdoc(function)))))
+    words = reflow("\n\n".join(filter(None, (verb.first, inspect.getdoc(function)))))
     app.command(name, cls=kind, help=words)(function)  # type: ignore[arg-type]  # typer only calls `cls`
     command = typer.main.get_command(app)
     # click keeps the help option of the first context that asks for it

@@ -18,7 +18,7 @@ from appliance.base.engine_thread import InCaller
 from appliance.base.log_output import replace_stderr
 from appliance.base.user_errors import UserError, with_remedy
 from appliance.cli.lazy import application
-from appliance.cli.verb_table import Group, Verb, Verbs, joined
+from appliance.cli.verb_table import Group, Verb, Verbs, merge
 from rosmop.tool.terminal import printable
 
 # Ask the three questions of a first contact, and print the next commands: `rosrv` alone on a terminal.
@@ -72,12 +72,12 @@ def first_contact(read: Callable[[str], str] = input, write: Callable[[str], Non
     """Ask on the terminal, and return the exit status."""
     try:
         write(_INTRODUCTION)
-        nodes = _asked(NODES, read, write)
+        nodes = _ask(NODES, read, write)
         if nodes == len(NODES.answers) - 1:
             _say(write, [("sudo rosrv demo", "shows a robot, its operator and an attacker on this machine")])
             return 0
-        driver = _asked(DRIVER, read, write)
-        deny = _asked(DENY, read, write) == 1
+        driver = _ask(DRIVER, read, write)
+        deny = _ask(DENY, read, write) == 1
         _say(write, next_commands(nodes, driver, deny=deny))
     except (EOFError, KeyboardInterrupt):
         write("")
@@ -101,7 +101,7 @@ def next_commands(nodes: int, driver: int, *, deny: bool) -> list[tuple[str, str
     ]
 
 
-def _asked(question: ContactQuestion, read: Callable[[str], str], write: Callable[[str], None]) -> int:
+def _ask(question: ContactQuestion, read: Callable[[str], str], write: Callable[[str], None]) -> int:
     write(question.text)
     for number, answer in enumerate(question.answers, 1):
         write(f"  {number}  {answer}")
@@ -138,7 +138,7 @@ def feature_verbs() -> tuple[Verbs, ...]:
 
 
 def all_verbs() -> Verbs:
-    return joined(VERBS, *feature_verbs())
+    return merge(VERBS, *feature_verbs())
 
 
 def _show_version(wanted: bool) -> None:

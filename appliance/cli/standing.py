@@ -51,7 +51,7 @@ from appliance.network.interfaces import addresses_by_interface
 from appliance.network.namespaces import Namespace
 from appliance.rpc.graph_reader import is_here
 from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph, MasterReader, MasterReadError
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 from roswire.errors import RosError
 from roswire.node.network import SourceNetwork
 from roswire.node.ros_node import RosNode
@@ -110,7 +110,7 @@ def stand_or_exit(appliance: Appliance, within: float, verb: str) -> None:
     try:
         said = asyncio.run(wait_until_robot_stands(appliance, appliance.way.state, within))
     except NotStandingError as error:
-        raise refused([printable(f"{verb}: {error}. Nothing was changed")]) from None
+        raise refusal([printable(f"{verb}: {error}. Nothing was changed")]) from None
     if not appliance.as_json:
         say(printable(said))
 
@@ -132,7 +132,7 @@ def _master_of(state: Path) -> tuple[str, str]:
     return node_uri(host, port), link_address() or host
 
 
-def _asked(appliance: Appliance, request: AdminRequest[A]) -> A:
+def _ask(appliance: Appliance, request: AdminRequest[A]) -> A:
     """Return the appliance's answer. Raises `NotStandingError`."""
     try:
         answer = appliance.ask(request)
@@ -140,7 +140,7 @@ def _asked(appliance: Appliance, request: AdminRequest[A]) -> A:
         raise NotStandingError(str(error)) from None
     if not answer.ok:
         raise NotStandingError(answer.error)
-    return answer.given()
+    return answer.unwrap()
 
 
 def _graph_of(found: Graph) -> MasterGraph:
@@ -212,9 +212,9 @@ async def wait_until_robot_stands(appliance: Appliance, state: Path, longest: fl
     Where the policy does not let this machine subscribe, as in a container, the appliance shows the messages.
     """
     master, source = _master_of(state)
-    found = _asked(appliance, GraphWanted())
+    found = _ask(appliance, GraphWanted())
     graph = _graph_of(found)
-    topics = motion_topics(graph, _robot_nodes(found, _asked(appliance, PolicyWanted())))
+    topics = motion_topics(graph, _robot_nodes(found, _ask(appliance, PolicyWanted())))
     try:
         return await _wait(graph, topics, longest, _by_node(master, source))
     except RosError:
@@ -298,7 +298,7 @@ def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
                 while not over.is_set():
                     order = {"verb": "topic look", "topic": topic, "messages": _MAX_OF_LOOK, "seconds": 1.0}
                     seen = msgspec.convert(
-                        _asked(appliance, msgspec.convert(order, look)), _Seen, from_attributes=True
+                        _ask(appliance, msgspec.convert(order, look)), _Seen, from_attributes=True
                     )
                     loop.call_soon_threadsafe(note, topic, kind, seen)
             except NotStandingError as error:
@@ -312,7 +312,7 @@ def _by_looks(appliance: Appliance, began: Graph) -> Hearing:
 
         async def unheard() -> str:
             await asyncio.sleep(_COUNTED_SECONDS)
-            now = _messages(await asyncio.to_thread(_asked, appliance, GraphWanted()))
+            now = _messages(await asyncio.to_thread(_ask, appliance, GraphWanted()))
             quiet = [
                 topic
                 for topic in judge.topics.commands

@@ -31,7 +31,7 @@ from appliance.channel.status_summary import process_names
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
-from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
+from appliance.cli.status_watch import StatusView, Watch, seconds_between, watch_status
 from appliance.features.views import pair_view, states_of
 from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
@@ -67,7 +67,7 @@ def status(
     each = seconds_between(every, "rosrv status", watch=watch)
     try:
         if watch:
-            raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
+            raise typer.Exit(watch_status(partial(_look, appliance), each, as_json=appliance.as_json))
         view = appliance.body_or_exit(_answer(appliance))
     except NotRunningError as error:
         raise usage_error(str(error)) from None
@@ -92,7 +92,7 @@ def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
 
 def _shown(answer: AdminAnswer[A], view: Callable[[A], StatusView]) -> AdminAnswer[StatusView]:
     if answer.ok:
-        return AdminAnswer(True, view(answer.given()))
+        return AdminAnswer(True, view(answer.unwrap()))
     return AdminAnswer(False, error=answer.error, findings=answer.findings, trouble=answer.trouble)
 
 
@@ -139,9 +139,9 @@ class StatusScreen:
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         grave = sum(alarm.severity == "alarm" for alarm in self.troubles)  # they come first
-        for place, trouble in enumerate(shortened([alarm.text for alarm in self.troubles], _MAX_TROUBLES)):
+        for place, trouble in enumerate(shorten([alarm.text for alarm in self.troubles], _MAX_TROUBLES)):
             yield Text(f"! {in_local_zone(trouble)}", style=_RED if place < grave else _YELLOW)
-        for line in map(in_local_zone, shortened(self.attention, _MAX_TROUBLES)):
+        for line in map(in_local_zone, shorten(self.attention, _MAX_TROUBLES)):
             yield Text(f"attention: {line}", style=_YELLOW)
         yield _grid(self.body, self.host_in_words)
         yield processes_table(self.body.processes, options.max_width)
@@ -305,7 +305,7 @@ def doubted_clock(clock: ClockState) -> str | None:
     return None if clock.synchronised else "not synchronised: run chrony or systemd-timesyncd"
 
 
-def shortened(lines: Sequence[str], most: int) -> list[str]:
+def shorten(lines: Sequence[str], most: int) -> list[str]:
     if len(lines) <= most:
         return list(lines)
     return [*lines[: most - 1], f"and {len(lines) - most + 1} more: rosrv status --json"]

@@ -87,7 +87,7 @@ def _time_of_day(nanoseconds: int) -> str:
     return local_text(nanoseconds, digits=0).partition("T")[2]
 
 
-def watched(look: Look, seconds: float, *, as_json: bool) -> int:
+def watch_status(look: Look, seconds: float, *, as_json: bool) -> int:
     """Show the status until Ctrl-C; return the exit status of the last one. Raises `AccessDeniedError`."""
     looks, console = _Looks(look), Console(highlight=False)
     try:

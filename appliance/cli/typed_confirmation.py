@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from appliance.cli.output import usage_error
-from rosmop.tool.terminal import printable, refused
+from rosmop.tool.terminal import printable, refusal
 
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask; needs --state")]
 
@@ -22,12 +22,12 @@ def confirm_state(context: typer.Context, state: Path, consequence: str) -> None
     try:
         found = state.is_dir()
     except PermissionError as error:
-        raise refused([f"rosrv: {error.filename}: {error.strerror}; run this as root"]) from None
+        raise refusal([f"rosrv: {error.filename}: {error.strerror}; run this as root"]) from None
     if not found:
-        raise refused(
+        raise refusal(
             [f"rosrv: {state}: no such directory; give the appliance's state directory with --state"]
         )
     if given is None:
         given = str(typer.prompt(f"{consequence}. Type {printable(str(state))} to continue", err=True))
     if Path(given).absolute() != state.absolute():
-        raise refused([f"rosrv: {printable(given)} is not {printable(str(state))}: nothing was changed"])
+        raise refusal([f"rosrv: {printable(given)} is not {printable(str(state))}: nothing was changed"])

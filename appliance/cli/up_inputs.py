@@ -24,7 +24,7 @@ from appliance.policy.policy import DEFAULT_PORTS
 from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder, read_usable
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import made_before_0_4
-from rosmop.tool.terminal import refused
+from rosmop.tool.terminal import refusal
 
 _STATE = Path("control", "state.db")
 _VALID = "valid"
@@ -108,7 +108,7 @@ def _require_specifications(folder: Path, site_keys: Sequence[str], *, kept: boo
         result = answer.read()
     os.waitpid(child, 0)
     if result != _VALID and result and kept:
-        refused([*result.splitlines(), "the specifications that were in force before stay in force"])
+        refusal([*result.splitlines(), "the specifications that were in force before stay in force"])
     elif result != _VALID:
         raise StartError(result or f"{folder}: the process that read the specifications exited early")
 
@@ -134,7 +134,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
         return "\n".join(findings)
     left_out = [*started.left_out, *unusable]
     unguarded = "; nothing guards the topics of files that cannot be read" if left_out else ""
-    refused(
+    refusal(
         [*findings, f"started without {', '.join([*started.unbuilt, *left_out])}{unguarded}: rosrv status"]
     )
     return ""

@@ -47,7 +47,7 @@ CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is
 _PACKAGES = Path(__file__).parents[2]
 
 
-def joined(core: Verbs, *features: Verbs) -> Verbs:
+def merge(core: Verbs, *features: Verbs) -> Verbs:
     table = list(core.items())
     for name, added in itertools.chain.from_iterable(verbs.items() for verbs in features):
         names = [known for known, _verb in table]
@@ -60,7 +60,7 @@ def joined(core: Verbs, *features: Verbs) -> Verbs:
 
 def _extend(name: str, known: Verb | Group, added: Verb | Group) -> Group:
     if isinstance(known, Group) and isinstance(added, Group):
-        return Group(known.help or added.help, joined(known.verbs, added.verbs), known.after or added.after)
+        return Group(known.help or added.help, merge(known.verbs, added.verbs), known.after or added.after)
     raise ValueError(f"the verb {name} of a feature is already defined")
 
 

@@ -109,7 +109,7 @@ class FeatureSection:
     def services(self) -> tuple[str, ...]:
         return ()
 
-    def recorded(self) -> dict[str, str]:
+    def audit_values(self) -> dict[str, str]:
         """Return the values that each start records in the audit log, by name: no secrets."""
         return {}
 

@@ -50,7 +50,7 @@ SECTIONS = tuple(feature.settings for feature in FEATURES if feature.settings is
 
 
 def with_features(place: str) -> Callable[[type[T]], type[T]]:
-    def extended(cls: type[T]) -> type[T]:
+    def extend(cls: type[T]) -> type[T]:
         for kind in SECTIONS:
             above, _, name = kind.place.rpartition(".")
             if above == place:
@@ -58,7 +58,7 @@ def with_features(place: str) -> Callable[[type[T]], type[T]]:
                 setattr(cls, name, kind())
         return cls
 
-    return extended
+    return extend
 
 
 _NETWORK = GetPydanticSchema(lambda _source, handler: handler(IPvAnyNetwork))
@@ -509,9 +509,9 @@ class Settings:
         values = dataclasses.asdict(self).items()
         return {name: hashlib.sha256(repr(value).encode()).hexdigest()[:16] for name, value in values}
 
-    def recorded(self) -> dict[str, dict[str, str]]:
+    def audit_values(self) -> dict[str, dict[str, str]]:
         """Return the values that sections admit to the audit log, by section and name."""
-        found = {kind.place: self.of(kind).recorded() for kind in SECTIONS}
+        found = {kind.place: self.of(kind).audit_values() for kind in SECTIONS}
         return {place: values for place, values in found.items() if values}
 
     @property

@@ -63,7 +63,7 @@ from appliance.control.rest.rest import RestLink, RestUses
 from appliance.control.rest.rest_certificate import RestCertificate
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master import rosout
-from appliance.master.calls.call import served
+from appliance.master.calls.call import served_calls
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.call_table import master_table
 from appliance.master.calls.gate import CallGate, HostLimits
@@ -167,7 +167,7 @@ class Control:
             int(given.reserve_bytes),
             holding=any(section.holds_records for section in settings.sections.values.values()),
         )
-        reserve = AUDIT_RESERVE.bounds.sized(
+        reserve = AUDIT_RESERVE.bounds.resize(
             int(given.reserve_bytes), int(given.reserve_bytes) // _HOSTS_IN_RESERVE
         )
         size = None if given.retention_bytes is None else int(given.retention_bytes)
@@ -224,10 +224,10 @@ class Control:
         settings, store = self.settings, self.store
         self.watchlist = Watchlist()
         self.carried = RelayTraffic(self.trail, self.registry, settings.relays, self.watchlist.cut_off)
-        self.grants = Grants(self.registry.mark, self.carried.used)
+        self.grants = Grants(self.registry.mark, self.carried.used_permissions)
         self.rights = ParameterRights(self.policy, self.trail)
         whole = int(settings.limits.parameter_bytes)
-        pool = Pool("bytes of parameters", PARAMETER_BYTES.bounds.sized(whole, whole // 2), self.quota_class)
+        pool = Pool("bytes of parameters", PARAMETER_BYTES.bounds.resize(whole, whole // 2), self.quota_class)
         self.parameters_dirty = asyncio.Event()
         self.parameters = ParameterMirror(
             store.load_parameters(),
@@ -404,7 +404,7 @@ class Control:
         node_calls = NodeCalls(
             registry, self.graph, relay, self.addresses, relay.nodes, self.liveness, self.call_gate, port
         )
-        self.serve_node = partial(self.pipeline.handler, served(NODE_CALLS.values(), node_calls))
+        self.serve_node = partial(self.pipeline.handler, served_calls(NODE_CALLS.values(), node_calls))
         arrivals = Arrivals(
             registry,
             self.graph,
@@ -515,7 +515,7 @@ class Control:
             live=self.revocation.live,
             switched_off=self.switched_off.rows,
             blocks=self.hosts.blocks.state,
-            handled=self.handled.marked,
+            handled=self.handled.with_marks,
             new_state=self.state_age.state,
             name=self.settings.name,
         )
@@ -590,7 +590,7 @@ class Control:
     def _registrar(self) -> Registrar:
         async def call(host: Address, local: str, method: str, values: tuple[Value, ...]) -> Value:
             peer = Peer(host, str(host), local)
-            return await self.pipeline.ordered(self.table, peer, MethodCall(method, values))
+            return await self.pipeline.run_order(self.table, peer, MethodCall(method, values))
 
         def silence() -> None:
             self.reminders.close()
@@ -634,7 +634,7 @@ class Control:
             self.trail,
             served=self.hosts.enrolment.served_by,
             certified=RestCertificate(self.store, self.trail, self.role.name).stated,
-            connected=self.core.rest.connected,
+            connected=self.core.rest.accept_websocket,
             require_proof=self.settings.api_require_proof,
             uses=uses,
         )

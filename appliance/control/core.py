@@ -293,7 +293,7 @@ class RestServices:
         """Take the WebSockets whose paths begin with `/door/`."""
         self._websocket.provide(handler)
 
-    def connected(self, name: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+    def accept_websocket(self, name: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
         handler = self._websocket()
         return _NO_WEBSOCKETS if handler is None else handler(name, ticket, peer, descriptor)
 

@@ -40,7 +40,7 @@ class MonitorCallGate:
 
     async def answer(self, wanted: MonitorCallWanted) -> MonitorCallAnswered:
         refused = await self._refused(wanted.service)
-        provider = next(iter(self.registry.registered(Kind.SERVICE, wanted.service)), None)
+        provider = next(iter(self.registry.registrants(Kind.SERVICE, wanted.service)), None)
         if not refused and provider is None:
             refused = "no node offers the service"
         if refused or provider is None:

@@ -57,7 +57,7 @@ class MotionStop:
         elif commanded := [
             topic
             for topic, monitors in begun.items()
-            if monitors is not None and self.policy().commanded(topic) is not None
+            if monitors is not None and self.policy().command_group(topic) is not None
         ]:
             text = f"no enabled guard has a safe message for {', '.join(commanded)}, so nothing stops the robot: {why}"
             self._record("motion not stopped", text, host, commanded)

@@ -326,7 +326,7 @@ class _Service:
         )
         calls, own = (control.pipeline.handler(control.table, own=own) for own in (False, True))
         listen = listener_limits.server
-        watched = listener_limits.answering.watched(calls)
+        watched = listener_limits.answering.watch(calls)
         await listener_limits.open(listen(sockets[RVMASTER].dup(), watched))
         await listener_limits.open(listen(sockets[OWN].dup(), own, guarded=False))
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
@@ -369,7 +369,7 @@ class _Service:
         if not restarted:
             name = {"robot": settings.name} if settings.name else {}
             more = {**name, "version": __version__, "configuration": settings.fingerprints()}
-            more |= {"settings": settings.recorded(), "off": control.monitors.off}
+            more |= {"settings": settings.audit_values(), "off": control.monitors.off}
             control.trail.happened("appliance started", f"nodes may connect at {uri}", more=more)
         else:
             text = "control started again after an unexpected end: no host holds a group of [Authority]"

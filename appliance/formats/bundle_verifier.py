@@ -73,14 +73,14 @@ def printable(text: str) -> str:
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
-def unhexed(text: str) -> bytes:
+def unhex(text: str) -> bytes:
     data = bytes.fromhex(text)
     if data.hex() != text:
         raise ValueError(f"{text[:80]!a} is not a valid hash")
     return data
 
 
-def packed(value: bytes | str | int | None) -> bytes:
+def pack(value: bytes | str | int | None) -> bytes:
     if value is None:
         return b"\xc0"
     if isinstance(value, int):
@@ -188,7 +188,7 @@ def require_bounded(archive: zipfile.ZipFile, size: int) -> None:
         raise ValueError(f"it unpacks to more than {most} bytes: too large for a bundle of its size")
 
 
-def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
+def open_bundle(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
     if not place.is_dir():
         with regular(place) as file:
             size = os.fstat(file.fileno()).st_size
@@ -231,7 +231,7 @@ class Verifier:
     def __init__(
         self, place: Path, key: Path | None, folder: Path, copies: dict[tuple[str, int], list[dict[str, Any]]]
     ) -> None:
-        self.names, self.open, self.foreign = opened(place)
+        self.names, self.open, self.foreign = open_bundle(place)
         self.key, self.copies = folder / "key", copies
         self.raw_key = self.read_key(key)
         self.findings: list[str] = []
@@ -386,16 +386,16 @@ class Verifier:
                     self.findings.append(f"record {sequence}: is not in the appliance's format")
                 detail = record["detail"].encode("utf-8", "surrogateescape")
                 columns = b"\xdc\x00\x13" + b"".join(
-                    map(packed, [*(record[column] for column in COLUMNS), detail])
+                    map(pack, [*(record[column] for column in COLUMNS), detail])
                 )
-                before, own = unhexed(chain["previous"]), unhexed(chain["hash"])
+                before, own = unhex(chain["previous"]), unhex(chain["hash"])
                 for fault in walk.add(sequence, before, columns, own):
                     what = (
                         "was changed" if fault is ProofFault.CHANGED else "does not follow the one before it"
                     )
                     self.findings.append(f"record {sequence}: {what}")
                 for content in chain["then"] or ():
-                    walk.skip(unhexed(content))
+                    walk.skip(unhex(content))
                 if chain["then"] is None:
                     matters = runs is None or runs.meet(walk.begin, sequence)
                     text = "lead to no checkpoint; version 0.1.0 wrote later records"
@@ -421,14 +421,14 @@ class Verifier:
             self.blame(UNSIGNED, f"checkpoint {number}: is not signed with the key")
         copies = self.copies.get((self.manifest["log"], number), [])
         for copy in copies:
-            if stated(copy) != stated(given):
+            if checkpoint_of(copy) != checkpoint_of(given):
                 but = "" if self.is_signed(copy) else ", which is not signed with the key"
                 self.blame(REWRITTEN, f"checkpoint {number}: differs from the one kept elsewhere{but}")
         self.checkpoints, self.signed = self.checkpoints + 1, self.signed + signed
-        self.agreeing += any(stated(copy) == stated(given) for copy in copies)
+        self.agreeing += any(checkpoint_of(copy) == checkpoint_of(given) for copy in copies)
 
     def is_signed(self, given: dict[str, Any]) -> bool:
-        made = stated(given)
+        made = checkpoint_of(given)
         try:
             same = parse_checkpoint(made.text()) == made
             fault = signature_fault(
@@ -447,7 +447,7 @@ class Verifier:
         return subprocess.run([*order, *files], capture_output=True).returncode == 0
 
 
-def stated(given: dict[str, Any]) -> Checkpoint:
+def checkpoint_of(given: dict[str, Any]) -> Checkpoint:
     fields: Any = (given.get(field) for field in Checkpoint._fields)
     return Checkpoint(*fields)
 
@@ -460,7 +460,7 @@ def kept_copies(path: Path) -> dict[tuple[str, int], list[dict[str, Any]]]:
             try:
                 copy = json.loads(line)
                 bytes.fromhex(copy["signature"] + copy["key"])
-                made = parse_checkpoint(stated(copy).text())
+                made = parse_checkpoint(checkpoint_of(copy).text())
             except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
                 continue
             kept[made.log, made.number].append(copy)

@@ -277,7 +277,7 @@ class NamedEntry(NamedTuple):
     entry: LogEntry
 
 
-def merged(logs: Mapping[str, Iterable[LogEntry]]) -> Iterator[NamedEntry]:
+def merge(logs: Mapping[str, Iterable[LogEntry]]) -> Iterator[NamedEntry]:
     """Yield the records of several logs by time, each once: a log has the order of its records, whatever its clock did.
 
     Retention by size writes some old records again at the end of a log, with their id, and a machine that was cloned

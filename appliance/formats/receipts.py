@@ -27,7 +27,7 @@ class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
             f"segment {self.segment}\nfirst {self.first}\nlast {self.last}\ntime {self.time}\n"
         ).encode()
 
-    def signed(self, key: Ed25519PrivateKey) -> "SegmentReceipt":
+    def sign(self, key: Ed25519PrivateKey) -> "SegmentReceipt":
         return msgspec.structs.replace(self, signature=key.sign(self.text()).hex())
 
     def is_signed(self, key: bytes) -> bool:

@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple, Protocol
 
 import msgspec
 
-from appliance.audit.log.columns import StoredColumns, packed, to_columns
+from appliance.audit.log.columns import StoredColumns, pack, to_columns
 from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.log.log_queries import chained_rows, number_of_records
 from appliance.audit.log.record_format import entry_of, stored_entry
@@ -216,7 +216,7 @@ class SegmentReader:
             fields = msgspec.json.decode(line)
             entry, chain = entry_of(fields), msgspec.convert(fields["chain"], ChainProof)
             columns, digest = to_columns(entry.record, entry.sequence), bytes.fromhex(chain.hash)
-            faults = walk.add(columns.sequence, previous, packed(columns), digest)
+            faults = walk.add(columns.sequence, previous, pack(columns), digest)
             same = bool(faults) or _line(columns, previous, digest, self.header.end) == line
         except _NOT_A_RECORD as error:
             raise SegmentError(f"record {sequence}: {error}") from error

@@ -28,7 +28,7 @@ class RevokedCertificates:
 
     def __init__(self, kept: HostTables) -> None:
         self._kept = kept
-        self._rows = {row.serial: row for row in kept.revoked()}
+        self._rows = {row.serial: row for row in kept.revoked_certificates()}
         self._ended: dict[str, float] = {}  # since when the clock shows that they ended long ago (monotonic)
         self.forget_ended()
 
@@ -51,7 +51,7 @@ class RevokedCertificates:
                 del self._rows[serial], self._ended[serial]
                 self._kept.forget_revoked(serial)
 
-    def listed(self, enrolled: Set[str]) -> list[RevokedCertificateRow]:
+    def rows_to_send(self, enrolled: Set[str]) -> list[RevokedCertificateRow]:
         rows = self._not_ended()
         if _bytes_of(rows) > ENTRIES_BYTES:
             rows = [row for row in rows if _matters(row, enrolled)]
@@ -67,7 +67,7 @@ class RevokedCertificates:
         rows = self._not_ended()
         if _bytes_of(rows) <= ENTRIES_BYTES:
             return 0
-        on_it = {row.serial for row in self.listed(enrolled)}
+        on_it = {row.serial for row in self.rows_to_send(enrolled)}
         return sum(_matters(row, enrolled) and row.serial not in on_it for row in rows)
 
     def wait_for_room(self, enrolled: Set[str]) -> float:

@@ -29,7 +29,7 @@ class Authority:
     def __init__(self, signer: Link) -> None:
         self._signer = signer
 
-    async def stated(self) -> messages.AuthorityStated:
+    async def statement(self) -> messages.AuthorityStated:
         return await self._ask(messages.AuthorityRequest, messages.AuthorityStated)
 
     async def issue(
@@ -82,7 +82,7 @@ class StoredAuthority:
         return ""
 
     async def certificate(self) -> bytes:
-        own = (await self._signer.stated()).certificate
+        own = (await self._signer.statement()).certificate
         kept = self._row
         if kept is not None and self._keeps(kept, own):
             return kept.certificate.encode()

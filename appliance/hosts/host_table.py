@@ -86,12 +86,12 @@ class HostTable:
 
     # --- hosts in the table ---
 
-    def enrolled(self) -> list[HostRow]:
+    def hosts(self) -> list[HostRow]:
         return [row for row in self.rows.values() if row.revoked is None]
 
-    def admitted(self) -> list[HostRow]:
+    def admitted_hosts(self) -> list[HostRow]:
         return [
-            row for row in self.enrolled() if self.declared.wants(row.name) and self.is_for_hosts(row.address)
+            row for row in self.hosts() if self.declared.wants(row.name) and self.is_for_hosts(row.address)
         ]
 
     def is_for_hosts(self, address: str) -> bool:
@@ -102,23 +102,23 @@ class HostTable:
 
     def addresses(self) -> dict[str, Address]:
         """Return the addresses that the policy has for `host:NAME` while the tunnels are open."""
-        return {row.name: ipaddress.ip_address(row.address) for row in self.admitted()}
+        return {row.name: ipaddress.ip_address(row.address) for row in self.admitted_hosts()}
 
     def enrolled_row(self, name: str) -> HostRow:
         """Return the row of an enrolled host. Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
-            known = ", ".join(host.name for host in self.enrolled()[:20])
+            known = ", ".join(host.name for host in self.hosts()[:20])
             others = f"the enrolled hosts: {known}" if known else "enrol it: rosrv host add NAME"
             raise UnknownHostError(f"no host {name[:80]!r} is enrolled; {others}")
         return row
 
     def at(self, address: str) -> HostRow | None:
-        found = next((row for row in self.enrolled() if row.address == address), None)
+        found = next((row for row in self.hosts() if row.address == address), None)
         return found if found is not None and self.is_for_hosts(address) else None
 
     def listed_as_revoked(self) -> list[RevokedCertificateRow]:
-        return self.revoked.listed(self._enrolled_names())
+        return self.revoked.rows_to_send(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:
         return self.revoked.missing(self._enrolled_names())
@@ -136,7 +136,7 @@ class HostTable:
             )
 
     def _enrolled_names(self) -> set[str]:
-        return {row.name for row in self.enrolled()}
+        return {row.name for row in self.hosts()}
 
     # --- names and addresses ---
 

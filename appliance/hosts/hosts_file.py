@@ -15,7 +15,7 @@ import yaml
 
 from appliance.base.input_files import read_given_text
 from appliance.base.validation_messages import meant, not_yaml
-from appliance.policy.policy_findings import quoted
+from appliance.policy.policy_findings import quote
 from appliance.telemetry.text_changes import changed_lines
 
 IN_BUNDLE = "hosts.yaml of the bundle"
@@ -204,7 +204,7 @@ class _Reading:
             try:
                 values[key] = _KEYS[key](given)
             except ValueError as error:
-                self._mistake(value, f"{key} is {quoted(str(given))}; {error}")
+                self._mistake(value, f"{key} is {quote(str(given))}; {error}")
         if len(self.mistakes) > mistakes:
             return
         if "name" not in values:
@@ -230,7 +230,7 @@ class _Reading:
             name = str(key.value)
             if name not in known:
                 hint = meant(name, known) or f"; known here: {', '.join(known)}"
-                self._mistake(key, f"unknown key {quoted(name)}{hint}")
+                self._mistake(key, f"unknown key {quote(name)}{hint}")
             elif name in seen:
                 self._mistake(key, f"{name} is given twice")
             else:

@@ -43,7 +43,7 @@ class SignedRevocations:
         self._state = (0, 0)
         self._signed = b""
 
-    async def signed(self) -> bytes:
+    async def signed_list(self) -> bytes:
         """Return the list, signed again if needed. Raises `AuthorityError`."""
         async with self._one_at_a_time:
             state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
@@ -122,7 +122,7 @@ class Tunnels:
 
     async def start(self) -> None:
         """Open the tunnels if hosts are enrolled; a failure is only logged, so nodes are still served."""
-        if not self._table.admitted():
+        if not self._table.admitted_hosts():
             return
         try:
             await self.open()
@@ -189,7 +189,7 @@ class Tunnels:
     def _until_it_changes(self) -> float:
         """Return the seconds until the next update: charon does not close a tunnel whose certificate ends."""
         now = clock.wall()
-        dates = [self._own_end, *(row.expires for row in self._table.admitted())]
+        dates = [self._own_end, *(row.expires for row in self._table.admitted_hosts())]
         ends = [date - now for date in dates if date > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
@@ -219,12 +219,12 @@ class Tunnels:
         if link is None or certificate is None or esp is None:
             return
         authority = await self._authority.certificate()
-        revocations = await self.revocations.signed()
+        revocations = await self.revocations.signed_list()
         now, blocked = clock.wall(), self._blocked()
         self._note_closed(blocked)
         hosts = [
             messages.TunnelHost(row.name, row.address, row.serial)
-            for row in self._table.admitted()
+            for row in self._table.admitted_hosts()
             if row.expires > now
             and address_of(row.address) not in blocked
             and row.name not in self._closed_from

@@ -193,7 +193,7 @@ class Signer:
         clock = AgeClock(directory / "age", lambda: newest_signing(directory))
         sync_index(directory)
         self._signed = CheckpointMemory(directory, clock)
-        self._removals = RemovalJudge(self._signed, kept, clock, clock.dated)
+        self._removals = RemovalJudge(self._signed, kept, clock, clock.true_date)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
 

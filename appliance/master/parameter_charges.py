@@ -48,11 +48,11 @@ class _Place:
     weight: int = 0  # bytes, without the places below
     below: "dict[str, _Place]" = field(default_factory=dict)
 
-    def owned(self) -> "Iterator[_Place]":
+    def owned_places(self) -> "Iterator[_Place]":
         if self.owner is not None:
             yield self
         for place in self.below.values():
-            yield from place.owned()
+            yield from place.owned_places()
 
 
 class ParameterCharges:
@@ -70,18 +70,18 @@ class ParameterCharges:
                 place = place.below.setdefault(part, _Place())
             place.owner = address_of(host)
 
-    def held(self, parts: Sequence[str], weight: int) -> Mapping[Address, int]:
+    def weights_by_owner(self, parts: Sequence[str], weight: int) -> Mapping[Address, int]:
         path = self._path(parts)
         owner = _owner(_region(path, parts))
         if len(path) <= len(parts):
             return {owner: weight}
         held: Counter[Address] = Counter()
-        for place in path[-1].owned():
+        for place in path[-1].owned_places():
             held[_owner(place)] += place.weight
         held[owner] += weight - held.total()
         return held
 
-    def replaced(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
+    def replace(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
         """Charge the owner for the weight `after` at this key (0: the key is deleted)."""
         path = self._path(parts)
         region = _region(path, parts)
@@ -112,9 +112,9 @@ class ParameterCharges:
     def _release(self, parts: Sequence[str], weight: int) -> None:
         path = self._path(parts)
         region = _region(path, parts)
-        for owner, amount in self.held(parts, weight).items():
+        for owner, amount in self.weights_by_owner(parts, weight).items():
             self.pool.give_back(owner, amount)
-        inside = sum(place.weight for place in path[-1].owned()) if len(path) > len(parts) else 0
+        inside = sum(place.weight for place in path[-1].owned_places()) if len(path) > len(parts) else 0
         region.weight -= weight - inside
         if len(path) <= len(parts):
             return
@@ -137,7 +137,7 @@ class ParameterCharges:
                 size = member_weight(name, member) if there else 0
                 owned += self._recount(below, member, size, (*parts, name), final=final)
             else:
-                for gone in below.owned():
+                for gone in below.owned_places():
                     self.pool.give_back(_owner(gone), gone.weight)
                 del place.below[name]
                 self._journal.parameters_disowned(_key((*parts, name)))

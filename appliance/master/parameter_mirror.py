@@ -75,7 +75,7 @@ class ParameterMirror:
         """
         pool = self.charges.pool
         parts, before = self._place_of(key)
-        held = self.charges.held(parts, before)
+        held = self.charges.weights_by_owner(parts, before)
         after = _with_namespaces(key, len(parts), weight)
         growth = max(0, after - held.get(host, 0))
         refusal = pool.take(host, growth) if growth else ""
@@ -98,7 +98,7 @@ class ParameterMirror:
         parts, before = self._place_of(key)
         self._put_in(key, value)
         after = _with_namespaces(key, len(parts), reserved.weight)
-        self.charges.replaced(parts, before, after, reserved.owner)
+        self.charges.replace(parts, before, after, reserved.owner)
         self.weight += after - before
         if parts:
             self._note(key, value)
@@ -113,7 +113,7 @@ class ParameterMirror:
             return
         before = member_weight(parts[-1], there)
         self._take_out(key)
-        self.charges.replaced(parts, before, 0, APPLIANCE)
+        self.charges.replace(parts, before, 0, APPLIANCE)
         self.weight -= before
         self._note(key, None)
         self._changed()

@@ -279,13 +279,13 @@ class MasterRegistrations:
             if most is not None and len(calls) + 2 > most:
                 break
             del self._differing[key]
-            wanted, stated = self.wanted(key), self._stated.pop(key, None)
+            wanted, stated = self.wanted_entry(key), self._stated.pop(key, None)
             calls += _calls(key, stated, wanted)
             if wanted is not None:
                 self._stated[key] = wanted
         return calls
 
-    def wanted(self, key: EntryKey) -> MasterEntry | None:
+    def wanted_entry(self, key: EntryKey) -> MasterEntry | None:
         kind, resource, name = key
         node = self._registry.holder(name)
         registration = None if node is None else node.registrations.get((kind, resource))
@@ -295,7 +295,7 @@ class MasterRegistrations:
         return MasterEntry(self._inner_uri(node), stand_in(node) if service else registration.detail)
 
     def _compare(self, key: EntryKey) -> None:
-        if self.wanted(key) == self._stated.get(key):
+        if self.wanted_entry(key) == self._stated.get(key):
             self._differing.pop(key, None)
         else:
             self._differing[key] = None

@@ -134,7 +134,7 @@ class BootHold:
         Without `nodes`, they are held off the master alone. Raises `FirewallError`; without a working back end, nothing
         is held.
         """
-        held = self._held()
+        held = self._held_ports()
         if held is None:
             return False
         removed = not self.is_intact()
@@ -157,7 +157,7 @@ class BootHold:
         Raises `FirewallError` if its rules are still in force.
         """
         try:
-            held = self._held()
+            held = self._held_ports()
         except FirewallError:
             held = None
         own = None if held is None else held.own_seconds
@@ -182,7 +182,7 @@ class BootHold:
         elif self.is_present:
             write_whole(self._armed, json.dumps(asdict(held)).encode(), 0o600)
 
-    def _held(self) -> HeldPorts | None:
+    def _held_ports(self) -> HeldPorts | None:
         if not self.is_present:
             return None
         try:

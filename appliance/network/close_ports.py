@@ -222,7 +222,7 @@ def is_applied(table: str = TABLE) -> bool:
     return f"table inet {table}" in _nft(["list", "tables"], "").splitlines()
 
 
-def applied() -> str:
+def applied_rules() -> str:
     """Return the rules that are in force, as text for `nft -f`; empty without any. Raises `NetworkError`."""
     return _nft(["-s", "list", "table", "inet", TABLE], "") if is_applied() else ""
 

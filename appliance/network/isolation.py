@@ -46,11 +46,11 @@ from appliance.network.firewall.firewall_rules import (
     family_of,
 )
 from appliance.network.firewall.nft import TABLE, NftBackend
-from appliance.network.firewall.rule_watch import RuleWatch, subscribed
+from appliance.network.firewall.rule_watch import RuleWatch, subscribe
 from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
 from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
-from appliance.network.port_holders import PortsInUseError, described
+from appliance.network.port_holders import PortsInUseError, describe_holder
 from appliance.network.public_address import PublicAddress, outward_address
 
 # Delete entries of the connection tracker.
@@ -286,8 +286,8 @@ class Isolation:
             f" {link} lookup {table}`, and `advertise` {source} to the networks behind it"
             for source, table in interfaces.tables_of_sources(self._host, link)
         ]
-        if taken := self._listened((*self.settings.ports, *self._tcp)):
-            holder = self._host.run(lambda: described(taken))
+        if taken := self._listening_ports((*self.settings.ports, *self._tcp)):
+            holder = self._host.run(lambda: describe_holder(taken))
             found.append(f"{holder}, which leads to the appliance: give it another port")
         no_router = {_no_router(family): _GLOBAL[family].replace("/", ".") for family in self.ends}
         found += [
@@ -363,7 +363,7 @@ class Isolation:
         master = self.settings.master
         return () if master is None or self.settings.takes_over() else (PortRange.one(master),)
 
-    def _wanted(self) -> tuple[PacketRule, ...]:
+    def _wanted_rules(self) -> tuple[PacketRule, ...]:
         master = (PortRange.one(self.settings.master),) if self.settings.master and self._serves_nodes else ()
         return isolation_rules(
             self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp, master=master,
@@ -371,7 +371,7 @@ class Isolation:
         )  # fmt: skip
 
     def watch_rules(self) -> RuleWatch:
-        return RuleWatch(subscribed(self._host), frozenset({TABLE, close_ports.TABLE}))
+        return RuleWatch(subscribe(self._host), frozenset({TABLE, close_ports.TABLE}))
 
     def put_rules_back(self) -> list[str]:
         """Install the rules again if the kernel lacks some; return the purposes of these. Raises `NetworkError`.
@@ -384,10 +384,10 @@ class Isolation:
             self._missing += [purpose for purpose in absent if purpose not in self._missing]
             if absent:
                 self.removed_at = clock.now()
-            if absent or (self._rules and self._rules != self._wanted()):
+            if absent or (self._rules and self._rules != self._wanted_rules()):
                 with installing_again():
                     self._put()
-            protection = self._host.run(close_ports.applied) if self._rules else ""
+            protection = self._host.run(close_ports.applied_rules) if self._rules else ""
             if self._protection and not protection and (self._missing or self.unprotected):
                 self._protect_again()
             else:
@@ -432,12 +432,12 @@ class Isolation:
     def _bring(self) -> None:
         """Install the wanted rules unless they are installed: an earlier call may have failed at any step."""
         with self._turn:
-            if self._rules != self._wanted():
+            if self._rules != self._wanted_rules():
                 self._put()
         self._forget_tunnels()
 
     def _put(self) -> None:
-        rules = self._wanted()
+        rules = self._wanted_rules()
         self._backend.install(rules)
         self._rules, self.installed_at = rules, clock.now()
         if self.settings.takes_over():
@@ -491,13 +491,13 @@ class Isolation:
 
     def _refuse_listeners(self, ranges: tuple[PortRange, ...]) -> None:
         """Raise `PortsInUseError` if a program of the host listens in `ranges`; it is named by the first of them."""
-        if clashes := self._listened(ranges):
+        if clashes := self._listening_ports(ranges):
             remedy = "stop it, or give the appliance other ports"
             if clashes[0] == self.settings.master:
                 remedy = "`sudo rosrv adopt` takes its graph over, or stop it"
-            raise PortsInUseError(f"{self._host.run(lambda: described(clashes))}; {remedy}")
+            raise PortsInUseError(f"{self._host.run(lambda: describe_holder(clashes))}; {remedy}")
 
-    def _listened(self, ranges: tuple[PortRange, ...]) -> list[int]:
+    def _listening_ports(self, ranges: tuple[PortRange, ...]) -> list[int]:
         in_use = sorted(self._host.run(listening_ports))
         return [port for span in ranges for port in in_use if span.first <= port <= span.last]
 
@@ -616,7 +616,7 @@ def isolation_rules(
             ]
             for so in (False, True)
         )
-        rules += [rule for ports in refused for rule in _refused(family, ports, outward)]
+        rules += [rule for ports in refused for rule in _refusal_rules(family, ports, outward)]
         rules += [_forward("TCP", ports, end, outward) for ports in there if ports not in master]
         # A node's old connection to its own master may be new to the connection tracker: its packets stay there, so
         # that the node sees it end, and not a reset, after which roscpp looks a service up only once.
@@ -656,7 +656,7 @@ def _loopback(family: Family, inward: Interface) -> PacketRule:
     return PacketRule("not from ::1", PacketVerdict.RETURN, chain=Chain.NAT, destination="::1")
 
 
-def _refused(family: Family, ports: PortRange, outward: Interface) -> tuple[PacketRule, ...]:
+def _refusal_rules(family: Family, ports: PortRange, outward: Interface) -> tuple[PacketRule, ...]:
     """Return the rules that refuse connections at once, whichever chain drops what would be forwarded.
 
     A client with addresses of both families goes on with the other. A program at ::1 is not the appliance's.

@@ -1,7 +1,7 @@
 """Make network namespaces, run code and programs in them, and delete them.
 
 Each call gets its own thread, which ends in the namespace, because a return could fail. A program with
-`PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent thread then ends; it needs `entered()`.
+`PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent thread then ends; it needs `inside()`.
 """
 
 import contextlib
@@ -146,7 +146,7 @@ class Namespace:
         self._let_go = weakref.finalize(self, os.close, descriptor)
 
     @contextlib.contextmanager
-    def entered(self) -> Iterator[None]:
+    def inside(self) -> Iterator[None]:
         """Move the calling thread into the namespace for the block, which must not await."""
         home = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
         try:

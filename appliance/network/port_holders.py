@@ -48,7 +48,7 @@ def port_holder(port: int) -> PortHolder | None:
     return next((_describe(Path("/proc", str(owner.pid))) for owner in owners.values()), None)
 
 
-def described(ports: list[int]) -> str:
+def describe_holder(ports: list[int]) -> str:
     """Return who holds the ports, such as `/usr/bin/rosmaster (roscore.service) holds TCP 11311`."""
     held = ", ".join(map(str, ports[:8])) + (f" and {len(ports) - 8} more" if len(ports) > 8 else "")
     return f"{port_holder(ports[0]) or 'a program'} holds TCP {held}"

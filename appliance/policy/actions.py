@@ -10,7 +10,7 @@ from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
-from appliance.policy.policy_findings import quoted
+from appliance.policy.policy_findings import quote
 from appliance.policy.sections import PARAMETERS
 from roswire.names import is_global_name
 
@@ -27,7 +27,7 @@ def parse_action(text: str) -> tuple[Category, str]:
     category = VERBS.get(verb)
     if category is None:
         verbs = ", ".join(VERBS)
-        raise BadWordError(f"{quoted(text)} does not begin with a known verb; one of {verbs}")
+        raise BadWordError(f"{quote(text)} does not begin with a known verb; one of {verbs}")
     return category, check_resource(category, name.strip())
 
 
@@ -37,9 +37,9 @@ def check_resource(category: Category, name: str) -> str:
         if ALIASES.get(name, name) not in COMMANDS:
             elsewhere = DECIDED_ELSEWHERE.get(name)
             guess = f": it is decided by {elsewhere}" if elsewhere else meant(name, COMMANDS)
-            raise BadWordError(f"{quoted(name)} is not a command{guess}")
+            raise BadWordError(f"{quote(name)} is not a command{guess}")
     elif not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
-        raise BadWordError(f"{quoted(name)} is not a resolved ROS name, such as /landshark/gps")
+        raise BadWordError(f"{quote(name)} is not a resolved ROS name, such as /landshark/gps")
     return name
 
 
@@ -49,7 +49,7 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
         return (canonical_address(ipaddress.ip_address(text)),)
     except ValueError:
         if "/" in text:
-            raise BadWordError(f"{quoted(text)} is not one host: give an address in it") from None
+            raise BadWordError(f"{quote(text)} is not one host: give an address in it") from None
         names = HostNames.of(policy.text, policy.enrolled, policy.robot)
     try:
         return tuple(_first(network) for network in names.networks(text))
@@ -62,7 +62,7 @@ def find_host(text: str, policy: Policy) -> Address:
     found = find_hosts(text, policy)
     if len(found) > 1 and text != ROBOT:
         some = ", ".join(map(str, found[:_MAX_NAMED]))
-        raise BadWordError(f"{quoted(text)} is not one host: give the address, such as {some}")
+        raise BadWordError(f"{quote(text)} is not one host: give the address, such as {some}")
     return found[0]
 
 

@@ -16,7 +16,7 @@ from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import Atom
 from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
 from appliance.policy.model import Address, Rule
-from appliance.policy.policy_findings import Findings, Place, quoted
+from appliance.policy.policy_findings import Findings, Place, quote
 from appliance.policy.sections import AUTHORITY
 from roswire.names import is_global_name
 
@@ -129,7 +129,7 @@ def read_authority(
             found[name] = _with_option(found[name], option, entry, groups, findings)
         else:
             guess = meant(name, found) or ": define it first, such as base = /cmd_vel"
-            findings.error(entry.key, f"no group {quoted(name)} is in [Authority]{guess}")
+            findings.error(entry.key, f"no group {quote(name)} is in [Authority]{guess}")
     ranked = {name for option, name, _entry in options if option == _RANK}
     for option, name, entry in options:
         if option == _FREE and name in found and name not in ranked:
@@ -147,7 +147,7 @@ def read_authority(
 def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings: Findings) -> None:
     word = entry.key
     if not _NAME.fullmatch(word.text) or word.text in _OPTIONS:
-        text = f"{quoted(word.text)} is not the name of a group: letters, digits and _ . - after a letter"
+        text = f"{quote(word.text)} is not the name of a group: letters, digits and _ . - after a letter"
         findings.error(word, text)
         return
     if len(found) >= _MAX:
@@ -157,7 +157,7 @@ def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings:
     taken = {name: group.name for group in found.values() for name in group.names}
     for value in entry.values:
         if not is_global_name(value.text):
-            text = f"{quoted(value.text)}: a group lists full names such as /cmd_vel, without patterns"
+            text = f"{quote(value.text)}: a group lists full names such as /cmd_vel, without patterns"
             findings.error(value, text)
         elif value.text in taken:
             findings.error(value, f"{value.text} is already in the group {taken[value.text]}")
@@ -176,7 +176,7 @@ def _check_ranked(group: AuthorityGroup, options: list[tuple[str, str, Entry]], 
         text = f"the group {group.name} has a rank, so it has one topic: only messages of one topic pass the same relay"
         findings.error(place, f"{text} process. Make a group with a rank of each topic")
     if not _ROS_NAME.fullmatch(group.name):
-        text = f"{quoted(group.name)} has a rank, so its name is a part of a topic's name: a letter, then letters,"
+        text = f"{quote(group.name)} has a rank, so its name is a part of a topic's name: a letter, then letters,"
         findings.error(place, f"{text} digits and _")
     for option, name, entry in options:
         if name == group.name and option in (*Claim, _RELEASE_AFTER):
@@ -194,12 +194,12 @@ def _read_rank(entry: Entry, groups: HostGroups, findings: Findings) -> tuple[tu
         node = "" if match is None else match[2]
         if node and not is_global_name(node):
             findings.error(
-                word, f"{quoted(node)} is not the name of a node: write HOST/NODE, such as robot/joy_node"
+                word, f"{quote(node)} is not the name of a node: write HOST/NODE, such as robot/joy_node"
             )
         host = word if match is None else Word(word.line, word.column, match[1])
         hosts = frozenset(atom for _text, atom in groups.read((host,)))
         if any(member.text == word.text for members in ranks for member in members):
-            findings.error(word, f"{quoted(word.text)} has two ranks")
+            findings.error(word, f"{quote(word.text)} has two ranks")
         ranks[-1].append(RankMember(word.text, hosts, node))
     if len(ranks) < 2 or not all(ranks):
         text = f"name at least two ranks with {_HIGHER} between them, the highest first"
@@ -217,7 +217,7 @@ def _read_free(entry: Entry, findings: Findings) -> float:
         seconds = float(match[1]) if (match := _SECONDS.fullmatch(text)) is not None else 0.0
     if not SHORTEST_FREE <= seconds <= LONGEST_FREE:
         bounds = f"give {SHORTEST_FREE * 1000:g}ms to {LONGEST_FREE:g}s, such as 300ms"
-        findings.error(entry.key, f"{quoted(text)} is not a time until a group is free: {bounds}")
+        findings.error(entry.key, f"{quote(text)} is not a time until a group is free: {bounds}")
         return DEFAULT_FREE
     return seconds
 
@@ -230,7 +230,9 @@ def _with_option(
         text = " ".join(value.text for value in entry.values)
         number = _SECONDS.fullmatch(text)
         if number is None or not SHORTEST_TIME <= float(number[1]) <= LONGEST_TIME:
-            fault = f"{quoted(text)} is not a valid time: give {SHORTEST_TIME:g}s to {LONGEST_TIME:g}s, such as 5s"
+            fault = (
+                f"{quote(text)} is not a valid time: give {SHORTEST_TIME:g}s to {LONGEST_TIME:g}s, such as 5s"
+            )
             findings.error(word, fault)
             return group
         return replace(group, release_after=float(number[1]))
@@ -240,7 +242,7 @@ def _with_option(
         return replace(group, free=_read_free(entry, findings))
     if option not in _OPTIONS:
         guess = meant(option, _OPTIONS) or f"; {', '.join(_OPTIONS)}"
-        findings.error(word, f"unknown option {quoted(option)} of a group{guess}")
+        findings.error(word, f"unknown option {quote(option)} of a group{guess}")
         return group
     atoms = frozenset(atom for _text, atom in groups.read(entry.values))
     return replace(group, hosts=(*group.hosts, (Claim(option), atoms)))

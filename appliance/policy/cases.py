@@ -18,7 +18,7 @@ from appliance.policy.hours import instant
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.policy.policy_findings import Findings, FindingSeverity, Place, PolicyFinding, quoted
+from appliance.policy.policy_findings import Findings, FindingSeverity, Place, PolicyFinding, quote
 from appliance.policy.rights import decide, needs_node, rights_of
 from roswire.names import is_global_name
 
@@ -84,7 +84,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
         place = Place(mark.line + 1, mark.column + 1) if mark else Place()
         findings.error(place, not_yaml(fault.problem or fault.context).removeprefix("is "))
     except yaml.YAMLError as fault:
-        findings.error(Place(), f"not YAML: {quoted(str(fault), 120)}")
+        findings.error(Place(), f"not YAML: {quote(str(fault), 120)}")
     return None
 
 
@@ -109,7 +109,7 @@ class _CaseReader:
         hosts: dict[str, Address] = {}
         if "hosts" in given:
             for name, (_, value) in self._mapping(given["hosts"][1], "hosts", None).items():
-                hosts.update((name, address) for address in self._addresses(value, quoted(name)))
+                hosts.update((name, address) for address in self._addresses(value, quote(name)))
         policy = compile_policy(self._policy.text, file=self._policy.file, hosts=hosts, robot=robot)
         self._policy = policy.at_any_time()
 
@@ -119,7 +119,7 @@ class _CaseReader:
             try:
                 yield canonical_address(ipaddress.ip_address(text))
             except ValueError:
-                self._error(scalar, f"{quoted(text)} is not an IP address")
+                self._error(scalar, f"{quote(text)} is not an IP address")
 
     def _case(self, node: _Node) -> Iterator[CaseResult]:
         case = self._mapping(node, "a case", ("host", "node", "at", *_EXPECTED))
@@ -130,7 +130,7 @@ class _CaseReader:
         if "node" in case:
             caller_id = self._text(case["node"][1], "node")
             if not is_global_name(caller_id):
-                self._error(case["node"][1], f"{quoted(caller_id)} is not a node name, such as /joystick")
+                self._error(case["node"][1], f"{quote(caller_id)} is not a node name, such as /joystick")
         policy = self._policy
         if "at" in case:
             try:
@@ -170,7 +170,7 @@ class _CaseReader:
                 return
             request = Request(host, caller_id, category, resource)
             if needs_node(request) and not caller_id:
-                self._error(node, f"{quoted(text)} makes a node part of the graph: the case needs node:")
+                self._error(node, f"{quote(text)} makes a node part of the graph: the case needs node:")
                 return
             decision = decide(policy, rights_of(request))
             line, column = node.start_mark.line + 1, node.start_mark.column + 1
@@ -189,9 +189,9 @@ class _CaseReader:
             text = self._text(key, "a key")
             if keys is not None and text not in keys:
                 guess = meant(text, keys) or f"; {what} has {', '.join(keys)}"
-                self._error(key, f"unknown key {quoted(text)}{guess}")
+                self._error(key, f"unknown key {quote(text)}{guess}")
             elif text in pairs:
-                self._error(key, f"the key {quoted(text)} is repeated")
+                self._error(key, f"the key {quote(text)} is repeated")
             else:
                 pairs[text] = (key, value)
         return pairs

@@ -10,7 +10,7 @@ from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network, canoni
 from appliance.policy.hours import HoursTable, RightTime, host_units
 from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.model import DOOR, HOST, Address, known_name
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 from appliance.policy.sections import ASK
 
 ROBOT = "robot"
@@ -81,10 +81,10 @@ class HostGroups:
             )
             self._findings.error(word, text)
         elif first is not None and first.word is not None:
-            text = f"the group {quoted(word.text)} is already defined at line {first.word.line}"
+            text = f"the group {quote(word.text)} is already defined at line {first.word.line}"
             self._findings.error(word, text)
         elif not _GROUP_NAME.fullmatch(word.text):
-            text = f"{quoted(word.text)} is not a group name: letters, digits and _ . - after a letter"
+            text = f"{quote(word.text)} is not a group name: letters, digits and _ . - after a letter"
             self._findings.error(word, text)
         else:
             self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
@@ -100,7 +100,7 @@ class HostGroups:
             text = " ".join(word.text for word in unit)
             atom = self._atom(unit[0]) if len(unit) == 1 else self._timed_atom(unit, text)
             if atom in atoms:
-                self._findings.warn(unit[0], f"{quoted(text)} is listed twice")
+                self._findings.warn(unit[0], f"{quote(text)} is listed twice")
             elif atom is not None:
                 atoms[atom] = text
         return tuple((text, atom) for atom, text in atoms.items())
@@ -143,7 +143,7 @@ class HostGroups:
                 meant(text, self.groups)
                 or "; a value is a group, an address, a network, host:NAME, door:NAME or *"
             )
-            self._findings.error(word, f"no group {quoted(text)} is defined{wanted}")
+            self._findings.error(word, f"no group {quote(text)} is defined{wanted}")
             return None
         try:
             network = canonical_network(ipaddress.ip_network(text))
@@ -176,13 +176,13 @@ class HostGroups:
         door = word.text.startswith(DOOR)
         if not _HOST_NAME.fullmatch(name.removeprefix(DOOR)):
             form = "door:NAME with the name of a door" if door else "host:NAME with the name of a certificate"
-            self._findings.error(word, f"{quoted(word.text)} is not {form}")
+            self._findings.error(word, f"{quote(word.text)} is not {form}")
         elif name not in self._warned_hosts:
             self._warned_hosts.add(name)
             guess = meant(name, [host for host in self._hosts if host.startswith(DOOR) is door])
-            text = f"no host {quoted(name)} is enrolled: host:{name} matches no host until it is{guess}"
+            text = f"no host {quote(name)} is enrolled: host:{name} matches no host until it is{guess}"
             if door:
-                text = f"there is no door {quoted(name.removeprefix(DOOR))}: {name} matches no host until it is added"
+                text = f"there is no door {quote(name.removeprefix(DOOR))}: {name} matches no host until it is added"
                 text += guess
             self._findings.warn(word, text)
         return None
@@ -214,7 +214,7 @@ class HostGroups:
             text = f"the group contains itself: {' = '.join([*shown, cycle[0]])}"
             self._findings.error(word, text)
 
-    def shown(self, words: Sequence[Word]) -> str:
+    def to_text(self, words: Sequence[Word]) -> str:
         parts: list[str] = []
         length = 0
         for word, *limits in self.units(words):
@@ -251,16 +251,16 @@ def _as_network(member: Address | Network) -> Network:
 def _address_fault(text: str) -> str:
     address, slash, _ = text.partition("/")
     if "%" in text:
-        return f"{quoted(text)} has a zone: write the address alone"
+        return f"{quote(text)} has a zone: write the address alone"
     try:
         ipaddress.ip_address(address)
     except ValueError:
         hint = "; an enrolled host is host:NAME, a door is door:NAME" if ":" in text else ""
-        return f"{quoted(text)} is not an IP address{hint}"
+        return f"{quote(text)} is not an IP address{hint}"
     if not slash:
-        return f"{quoted(text)} is not an IP address"
+        return f"{quote(text)} is not an IP address"
     try:
         network = ipaddress.ip_network(text, strict=False)
     except ValueError:
-        return f"{quoted(text)} is not a network: the part after the slash is a number of bits"
-    return f"{quoted(text)} has bits set beyond its prefix: did you mean {network} or {address}?"
+        return f"{quote(text)} is not a network: the part after the slash is a number of bits"
+    return f"{quote(text)} has bits set beyond its prefix: did you mean {network} or {address}?"

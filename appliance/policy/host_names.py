@@ -16,7 +16,7 @@ from appliance.policy.groups import ROBOT
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
 from appliance.policy.ini_reader import read
 from appliance.policy.model import DOOR, HOST, Address, known_name, plain_address
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 from appliance.policy.sections import GROUPS
 
 HostInWords = Callable[[str], str]
@@ -81,12 +81,12 @@ class HostNames:
         if text in self.groups:
             return f"the address of {text} is not known"
         if text.startswith(DOOR):
-            return f"there is no door {quoted(text.removeprefix(DOOR))}{meant(name, self.enrolled)}"
+            return f"there is no door {quote(text.removeprefix(DOOR))}{meant(name, self.enrolled)}"
         if text.startswith(HOST):
-            return f"no host {quoted(name)} is enrolled{meant(name, self.enrolled)}"
+            return f"no host {quote(name)} is enrolled{meant(name, self.enrolled)}"
         known = [*self.groups, *self.enrolled]
         guess = meant(text, known) or f"; the names are {', '.join(known[:_MAX_NAMED])}"
-        return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
+        return f"{quote(text)} is not an address, nor the name of a group or an enrolled host{guess}"
 
     def labels(self) -> list[tuple[Network, str]]:
         rows = [(-1, _network_of(address), name) for name, address in self.enrolled.items()]

@@ -15,7 +15,7 @@ from zoneinfo import ZoneInfo
 from appliance.base.validation_messages import meant
 from appliance.policy.host_sets import Atom
 from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 
 UNTIL, DURING = "until", "during"
 LIMITING = (UNTIL, DURING)
@@ -87,11 +87,11 @@ class RightTime:
     hours: Hours | None
 
     def changes(self, hours: HoursNow) -> set[float]:
-        """Return the next begin, and the ends by which `closed` decides. The end by date stays when it has passed."""
+        """Return the next begin, and the ends by which `closed_at` decides. A passed end by date stays."""
         begins = {hours.begin} if hours.begin is not None and hours.begin < self.until else set()
         return {one for one in (self.until, hours.end, *begins) if abs(one) < math.inf}
 
-    def closed(self, now: float, passed: Mapping[float, bool], hours: HoursNow) -> "ClosedTime | None":
+    def closed_at(self, now: float, passed: Mapping[float, bool], hours: HoursNow) -> "ClosedTime | None":
         if passed.get(self.until, now >= self.until):
             return ClosedTime(f"{self.limit} has ended", for_good=True)
         is_closed = passed.get(hours.end, hours.end == NEVER)
@@ -117,7 +117,7 @@ def closed_times(times: Times, now: float | None, passed: Mapping[float, bool]) 
     if now is None:
         return {atom: ClosedTime(f"{one.limit} waits until the clock is set") for atom, one in times.items()}
     hours = _hours_at(times, now)
-    found = ((atom, one.closed(now, passed, hours[one.hours])) for atom, one in times.items())
+    found = ((atom, one.closed_at(now, passed, hours[one.hours])) for atom, one in times.items())
     return {atom: closed for atom, closed in found if closed is not None}
 
 
@@ -142,7 +142,7 @@ def instant(text: str, zone: tzinfo) -> float:
     except ValueError:
         given = None
     if given is None or form is None or not 2000 <= given.year < 3000:
-        raise ValueError(f"{quoted(text)} is not a date: write 2026-12-05, or 2026-12-05T18:00")
+        raise ValueError(f"{quote(text)} is not a date: write 2026-12-05, or 2026-12-05T18:00")
     minutes = given.hour * 60 + given.minute if form[1] else _WHOLE_DAY
     return min(_instants(given.date(), minutes, zone)) + given.second
 
@@ -189,7 +189,7 @@ class HoursTable:
                     if word.text in groups
                     else "at most 32 letters, digits and _ . -, a letter first"
                 )
-                findings.error(word, f"{quoted(word.text)} is not a name of hours: {why}")
+                findings.error(word, f"{quote(word.text)} is not a name of hours: {why}")
             self._unused[word.text] = word
             spans = tuple(self._spans(entry))
             if len(spans) > _SPANS:
@@ -200,7 +200,7 @@ class HoursTable:
 
     def warn_unused(self) -> None:
         for name, word in self._unused.items():
-            self._findings.warn(word, f"the hours {quoted(name)} are not used")
+            self._findings.warn(word, f"the hours {quote(name)} are not used")
 
     def time_of(self, unit: tuple[Word, ...]) -> RightTime | None:
         """Return the time of a host; None if it has none, or a mistake."""
@@ -234,7 +234,7 @@ class HoursTable:
         hours = self._hours.get(word.text)
         if hours is None:
             add = meant(word.text, self._hours) or f": add a line such as {word.text} = 22:00-06:00"
-            self._findings.error(word, f"[Hours] has no {quoted(word.text)}{add}")
+            self._findings.error(word, f"[Hours] has no {quote(word.text)}{add}")
         return hours
 
     def _until(self, word: Word) -> float | None:
@@ -254,7 +254,7 @@ class HoursTable:
         except (KeyError, ValueError, OSError):
             pass
         hint = "write a name such as Europe/Berlin or UTC; this machine's list is the package tzdata"
-        self._findings.error(entry.key, f"{quoted(text)} is not a zone of this machine: {hint}")
+        self._findings.error(entry.key, f"{quote(text)} is not a zone of this machine: {hint}")
         return UTC
 
     def _spans(self, entry: Entry) -> Iterable[Span]:
@@ -269,7 +269,7 @@ class HoursTable:
             begin, end, some = first * 60 + second, third * 60 + fourth, True
             if begin == end or end > _WHOLE_DAY:
                 self._findings.error(
-                    word, f"{quoted(word.text)} is not a time of a day: a whole day is 00:00-24:00"
+                    word, f"{quote(word.text)} is not a time of a day: a whole day is 00:00-24:00"
                 )
             yield Span(days, begin, end)
         if not some:
@@ -282,7 +282,7 @@ class HoursTable:
             begin, end = _DAYS.index(first), _DAYS.index(last)
             return frozenset((begin + number) % 7 for number in range((end - begin) % 7 + 1))
         text = "write days and times such as mon-fri 06:00-14:00 sat 08:00-12:00"
-        self._findings.error(word, f"{quoted(word.text)} is neither days nor a time: {text}")
+        self._findings.error(word, f"{quote(word.text)} is neither days nor a time: {text}")
         return frozenset()
 
 

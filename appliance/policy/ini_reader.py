@@ -7,7 +7,7 @@ import re
 from collections.abc import Hashable, MutableMapping
 from dataclasses import dataclass, field
 
-from appliance.policy.policy_findings import Findings, Place, quoted
+from appliance.policy.policy_findings import Findings, Place, quote
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
 """The most characters of a policy; one with 10,000 rules has about 600,000."""
@@ -58,7 +58,7 @@ def is_repeated(
     """Return whether an earlier line of the section has this key, which is an error."""
     first = first_lines.setdefault(key, word.line)
     if first != word.line:
-        findings.error(word, f"the key {quoted(word.text)} is already defined at line {first}{remedy}")
+        findings.error(word, f"the key {quote(word.text)} is already defined at line {first}{remedy}")
     return first != word.line
 
 
@@ -69,7 +69,7 @@ def read(text: str, findings: Findings) -> list[SectionText]:
         return []
     if (at := text.find("\0")) >= 0:
         place = Place(text.count("\n", 0, at) + 1, at - text.rfind("\n", 0, at))
-        findings.error(place, f"unexpected character {quoted(text[at])}: this is not a text file")
+        findings.error(place, f"unexpected character {quote(text[at])}: this is not a text file")
         return []
     sections: list[SectionText] = []
     for number, raw in enumerate(text.removeprefix("\ufeff").split("\n"), start=1):
@@ -77,7 +77,7 @@ def read(text: str, findings: Findings) -> list[SectionText]:
         if not line.strip():
             continue
         if foreign := _FOREIGN.search(line):
-            shown = quoted(foreign.group())
+            shown = quote(foreign.group())
             place = Place(number, foreign.start() + 1)
             findings.error(place, f"unexpected character {shown}: rules are plain ASCII")
         elif line.lstrip().startswith("["):
@@ -100,10 +100,10 @@ def _begin_section(line: str, number: int, sections: list[SectionText], findings
     name = inside.strip()
     word = Word(number, start + 1, name)
     if not bracket:
-        findings.error(word, f'the section {quoted(line.strip())} is not closed: add "]"')
+        findings.error(word, f'the section {quote(line.strip())} is not closed: add "]"')
     elif rest.strip():
         column = start + 1 + len(inside) + 1 + len(rest) - len(rest.lstrip()) + 1
-        findings.error(Place(number, column), f"unexpected text after the section: {quoted(rest.strip())}")
+        findings.error(Place(number, column), f"unexpected text after the section: {quote(rest.strip())}")
     # Keep the section in spite of the error, so that its entries are not added to the section before.
     sections.append(SectionText(word))
 
@@ -112,11 +112,11 @@ def _add_entry(line: str, number: int, sections: list[SectionText], findings: Fi
     left, equals, right = line.partition("=")
     key = Word(number, len(left) - len(left.lstrip()) + 1, " ".join(left.split()))
     if not equals:
-        findings.error(key, f"expected key = value, found {quoted(key.text)}")
+        findings.error(key, f"expected key = value, found {quote(key.text)}")
     elif not key.text:
         findings.error(key, 'expected a key before "="')
     elif not sections:
-        findings.error(key, f"{quoted(key.text)} is before the first section: add one, such as [Groups]")
+        findings.error(key, f"{quote(key.text)} is before the first section: add one, such as [Groups]")
     else:
         words = _WORD.finditer(right)
         values = tuple(Word(number, len(left) + 1 + m.start() + 1, m.group()) for m in words)

@@ -47,7 +47,7 @@ class PolicyContext:
     now: float | None = None
     ends: Mapping[float, bool] = field(default_factory=dict)
 
-    def compiled(self, text: str, file: str) -> Policy:
+    def compile(self, text: str, file: str) -> Policy:
         """Compile a text for these addresses. Raises `PolicyError`."""
         return compile_policy(
             text,
@@ -119,7 +119,7 @@ class PolicyJudgement(NamedTuple):
     results: list[CaseResult]
     signed_by: str
 
-    def accepted(self) -> Policy:
+    def accept(self) -> Policy:
         """Return the policy. Raises `PolicyError` with every failed test case."""
         failed = [result.finding for result in self.results if not result.passed]
         if failed:
@@ -129,7 +129,7 @@ class PolicyJudgement(NamedTuple):
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
     """Check a text. Raises `PolicyError` with all its errors, or else those of the signature and the test cases."""
-    policy = known.compiled(text, file)
+    policy = known.compile(text, file)
     try:
         signed_by = signer(known.site_keys, text, signature)
     except UnsignedError as error:

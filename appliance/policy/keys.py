@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from appliance.policy.ini_reader import Word
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 from roswire.errors import InvalidNameError
 from roswire.names import is_global_name, resolve_parameter
 
@@ -103,7 +103,7 @@ def ties(key: Key, word: Word, earlier: list[tuple[Key, int]], findings: Finding
     """Return whether the key ties with an earlier one, which is an error; add it to the earlier ones."""
     for other, line in earlier:
         if key.ties_with(other):
-            both = f"{quoted(word.text)} and {quoted(other.text)} (line {line})"
+            both = f"{quote(word.text)} and {quote(other.text)} (line {line})"
             text = f"{both} are equally specific and match the same names: change one of them"
             findings.error(word, text)
             return True
@@ -141,7 +141,7 @@ class _Node(Generic[Value]):
     value: tuple[Key, Value] | None = None
     subtree: tuple[Key, Value] | None = None
 
-    def starred(self, level: str) -> Iterator["_Node[Value]"]:
+    def starred_nodes(self, level: str) -> Iterator["_Node[Value]"]:
         for length, table in self.stars:
             node = table.get(level[:length])
             if node is not None:
@@ -198,7 +198,7 @@ class KeyTree(Generic[Value]):
                 found.append(inherited)
         return [value for _, value in found]
 
-    def inherited(self, name: str) -> Value | None:
+    def inherited_value(self, name: str) -> Value | None:
         """Return the value for names below `name` that no more specific key matches."""
         inherited, _ = self._walk(name)
         return inherited[1] if inherited is not None else None
@@ -227,7 +227,7 @@ def _next(node: _Node[Value], level: str) -> Iterator[_Node[Value]]:
     child = node.names.get(level)
     if child is not None:
         yield child
-    yield from node.starred(level)
+    yield from node.starred_nodes(level)
 
 
 def _everything(node: _Node[Value]) -> Iterator[tuple[Key, Value]]:
@@ -250,7 +250,7 @@ def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | Non
     for depth in range(len(path) - 1, -1, -1):
         node = path[depth]
         if node.stars and depth < len(parts):
-            for child in node.starred(parts[depth]):
+            for child in node.starred_nodes(parts[depth]):
                 found = _find_behind_star(child, parts, depth + 1)
                 if found is not None:
                     return found

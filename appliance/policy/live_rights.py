@@ -56,7 +56,7 @@ def may_keep(policy: Policy, live: LiveRight) -> Decision:
     return decide(policy, rights_to_keep(request, live.call, live.resource, namespace=live.namespace))
 
 
-def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[str]]:
+def lost_rights(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[str]]:
     lost: dict[Address, set[str]] = {}
     kept: set[Address] = set()
     for live in things:

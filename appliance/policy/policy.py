@@ -19,7 +19,7 @@ from appliance.policy.host_sets import Atom, HostSets, Network, canonical_addres
 from appliance.policy.hours import ClosedTimes, Times, closed_times
 from appliance.policy.keys import Key, KeyTree, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.policy_findings import Place, PolicyFinding, quoted
+from appliance.policy.policy_findings import Place, PolicyFinding, quote
 from appliance.policy.rate_limits import NO_LIMIT, LimitRule, LimitScope, LimitTable, Rate
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS
 from roswire.names import is_global_name
@@ -185,10 +185,10 @@ class Policy:
         atoms = self.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
         if namespace:
-            inherited = table.tree.inherited(request.resource) or table.default
+            inherited = table.tree.inherited_value(request.resource) or table.default
             if inherited is None:
                 reason = f"{self._what(request, 'may not')}: no key of [Parameters] matches what is below it"
-                return _decided(False, None, reason, table.audit_only)
+                return _decision(False, None, reason, table.audit_only)
             deciding.append(inherited)
         denying = [rule for rule in deciding if not rule.grants(atoms)]
         for rule in sorted(
@@ -226,7 +226,7 @@ class Policy:
         text, network = str(canonical_address(address)), self.hosts.narrowest(address)
         ever, named_as = self.hosts.atoms_of(address), network or ipaddress.ip_network(text)
         atoms = self.hosts.atoms_of(address, self.closed) if self.closed else ever
-        free, learned = self.blocked(address) is None, self._any_audit_only and not self.named
+        free, learned = self.block_of(address) is None, self._any_audit_only and not self.named
         known = free and (learned or not self.named.isdisjoint(atoms))
         return HostStanding(atoms, ever, known, free and network is not None, named_as, str(named_as), text)
 
@@ -254,7 +254,7 @@ class Policy:
         closed = [self.closed[atom].why for atom in self.times_of(address, hosts) if atom in self.closed]
         return f"its right {' and '.join(dict.fromkeys(closed[:2]))}" if closed else ""
 
-    def unnamed(self, address: Address) -> str:
+    def why_unnamed(self, address: Address) -> str:
         """Return why `knows` is false for a host that is not blocked."""
         closed = self.closed_to(address, self.named)
         return f"no rule of the policy names {self.standing(address).text}" + (
@@ -262,14 +262,14 @@ class Policy:
         )
 
     def serves(self, address: Address) -> bool:
-        return self.knows(address) or (self._any_audit_only and self.blocked(address) is None)
+        return self.knows(address) or (self._any_audit_only and self.block_of(address) is None)
 
-    def blocked(self, address: Address) -> Decision | None:
+    def block_of(self, address: Address) -> Decision | None:
         if not self.blocks or (block := self.blocks.get(host := canonical_address(address))) is None:
             return None
         return Decision(False, None, f"{host} is {block}", told=f"{host} is blocked by an operator")
 
-    def commanded(self, name: str) -> AuthorityGroup | None:
+    def command_group(self, name: str) -> AuthorityGroup | None:
         return self._commanded.get(name)
 
     def may_command(self, name: str, host: Address) -> bool:
@@ -282,7 +282,7 @@ class Policy:
 
     def holder(self, group: AuthorityGroup) -> Address | None:
         host = (self.holders or {}).get(group.name)
-        if host is None or self.blocked(host) is not None or group.claim(self.atoms_of(host)) is None:
+        if host is None or self.block_of(host) is not None or group.claim(self.atoms_of(host)) is None:
             return None
         return host
 
@@ -319,7 +319,7 @@ class Policy:
         return tuple(self.tables[category].rules)
 
     def _decide(self, request: Request) -> Decision:
-        denial = self.blocked(request.host)
+        denial = self.block_of(request.host)
         if denial is not None:
             return denial
         category = request.category
@@ -329,7 +329,7 @@ class Policy:
             if name not in commands.COMMANDS:
                 return Decision(False, None, _not_a_command(name))
         elif not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
-            return Decision(False, None, f"{quoted(name)} is not a resolved ROS name")
+            return Decision(False, None, f"{quote(name)} is not a resolved ROS name")
         table = self.tables[category]
         found = table.tree.find(name)
         if category is Category.COMMAND and name in commands.NAMED_ONLY:
@@ -355,7 +355,7 @@ class Policy:
             reason = f"{may_not}: no line of {place_of(group.rule)} {lets}"
             return Decision(False, group.rule, reason)
         if group.ranks:
-            return self._ranked(request, decision, group)
+            return self._apply_rank(request, decision, group)
         holder = self.holder(group)
         now = "" if self.holders is None else f"; now {holder or 'no host'} holds it"
         if request.category is Category.CALL and not self.may_command(request.resource, request.host):
@@ -365,7 +365,7 @@ class Policy:
         reason = f"{decision.reason}, while it holds {group.name}{now}"
         return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
 
-    def _ranked(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
+    def _apply_rank(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
         """Deny calls: only messages have a rank."""
         if request.category is Category.CALL:
             told = f"{self._what(request, 'may not')}: {group.name} has a rank, which services cannot have"
@@ -388,7 +388,7 @@ class Policy:
         if found is None:
             section = BY_CATEGORY[request.category].name
             reason = f"{self._what(request, 'may not')}: no key of [{section}] matches and it has no default"
-            return _decided(False, None, reason, table.audit_only)
+            return _decision(False, None, reason, table.audit_only)
         atoms = self.atoms_of(request.host)
         if found.grants(atoms):
             reason = f"{self._what(request, 'may')} by {found.place}"
@@ -413,7 +413,7 @@ class Policy:
             return Decision(True, rule.rule, reason, asks=request)
         reason = f"{self._what(request, 'needs an approval to')}, by {rule.place}"
         if audit_only:
-            return _decided(False, rule.rule, reason, audit_only)
+            return _decision(False, rule.rule, reason, audit_only)
         held = self.approved is not None and request.category is Category.CALL
         return Decision(held, rule.rule, reason, asks=request)
 
@@ -433,7 +433,7 @@ class Policy:
         reason = (
             f"{self._what(request, 'may not')}: the policy has no [{decider.name}] section, so no host may"
         )
-        return _decided(False, None, reason, table.audit_only)
+        return _decision(False, None, reason, table.audit_only)
 
 
 class CurrentPolicy:
@@ -465,10 +465,10 @@ def _not_a_command(name: str) -> str:
     elsewhere = commands.DECIDED_ELSEWHERE.get(name)
     if elsewhere is not None:
         return f"{name} is decided by {elsewhere}"
-    return f"{quoted(name)} is not a call that the appliance knows"
+    return f"{quote(name)} is not a call that the appliance knows"
 
 
-def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) -> Decision:
+def _decision(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) -> Decision:
     if audit_only and not allowed:
         return Decision(True, rule, reason, would_deny=True)
     return Decision(allowed, rule, reason)
@@ -477,13 +477,13 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
     told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
-    decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
+    decision = _decision(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
     return replace(decision, told=told)
 
 
 def _shorten(text: str, limit: int = 60) -> str:
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
-    return shown if shown.isprintable() else quoted(text, limit)
+    return shown if shown.isprintable() else quote(text, limit)
 
 
 def place_of(rule: Rule) -> str:

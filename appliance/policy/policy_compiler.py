@@ -11,7 +11,7 @@ from appliance.policy.hours import closed_times
 from appliance.policy.ini_reader import SectionText, read
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 from appliance.policy.policy_lint import lint
 from appliance.policy.policy_settings import read_monitor, read_options, read_ports
 from appliance.policy.rate_limits import read_limits
@@ -92,7 +92,7 @@ def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionT
         if name is None:
             guess = meant(place.text, sections.NAMES)
             known = "" if guess else f"; sections are {', '.join(sections.NAMES)}"
-            findings.error(place, f"unknown section {quoted(place.text)}{guess}{known}")
+            findings.error(place, f"unknown section {quote(place.text)}{guess}{known}")
             name = nearest(place.text, sections.NAMES)
             if name is not None and name.casefold() not in there:
                 by_name.setdefault(name, section)  # use the intended name: one mistake causes one error

@@ -82,7 +82,7 @@ class Findings:
         raise PolicyError(findings)
 
 
-def quoted(text: str, limit: int = 60) -> str:
+def quote(text: str, limit: int = 60) -> str:
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return '"' + "".join(c if c.isprintable() and c != '"' else _escape(c) for c in shown) + '"'
 

@@ -11,7 +11,7 @@ from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network
 from appliance.policy.ini_reader import SectionText
 from appliance.policy.model import Category
 from appliance.policy.policy import CompiledRule, RuleTable
-from appliance.policy.policy_findings import Findings, Place, quoted
+from appliance.policy.policy_findings import Findings, Place, quote
 
 Tables = Mapping[Category, RuleTable]
 _NODE_CATEGORIES = (Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER)
@@ -109,7 +109,7 @@ def _nodes_that_cannot_start(
 def _unused_groups(groups: HostGroups, findings: Findings) -> None:
     for name, group in groups.groups.items():
         if not group.used and group.word is not None:
-            findings.warn(group.word, f"the group {quoted(name)} is not used")
+            findings.warn(group.word, f"the group {quote(name)} is not used")
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:

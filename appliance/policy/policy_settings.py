@@ -8,7 +8,7 @@ from appliance.base.validation_messages import meant
 from appliance.policy.ini_reader import Entry, SectionText, is_repeated
 from appliance.policy.model import TELLS
 from appliance.policy.policy import DEFAULT_PORTS
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 from appliance.policy.sections import DECIDERS
 from roswire.names import is_global_name
 
@@ -64,7 +64,7 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
     for entry in _entries(section, tuple(names), findings):
         for word in entry.values:
             if not is_global_name(word.text):
-                text = f"{quoted(word.text)} is not a resolved name (/landshark/gps) without patterns"
+                text = f"{quote(word.text)} is not a resolved name (/landshark/gps) without patterns"
                 findings.error(word, text)
             elif word.text in names[entry.key.text]:
                 findings.warn(word, f"{word.text} is listed twice")
@@ -89,7 +89,7 @@ def _one_of(entry: Entry, words: Sequence[str], findings: Findings) -> str:
     text = " ".join(word.text for word in entry.values)
     if text not in words:
         word = entry.values[0] if entry.values else entry.key
-        shown = f"{entry.key.text} is {' or '.join(words)}, not {quoted(text)}{meant(text, words)}"
+        shown = f"{entry.key.text} is {' or '.join(words)}, not {quote(text)}{meant(text, words)}"
         findings.error(word, shown)
     return text
 
@@ -106,7 +106,7 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
         else:
             guess = meant(word.text, ["all", *by_fold.values()])
             known = "" if guess else f"; all, or some of {', '.join(by_fold.values())}"
-            findings.error(word, f"{quoted(word.text)} decides nothing{guess}{known}")
+            findings.error(word, f"{quote(word.text)} decides nothing{guess}{known}")
     if chosen:
         what = "are" if len(chosen) == len(by_fold) else f"by [{'], ['.join(sorted(chosen))}] are"
         findings.warn(entry.key, f"audit-only: denials {what} only recorded")
@@ -121,6 +121,6 @@ def _entries(section: SectionText | None, keys: Collection[str], findings: Findi
             guess = (
                 meant(word.text, keys) or f"; [{section.name.text if section else ''}] has {', '.join(keys)}"
             )
-            findings.error(word, f"unknown key {quoted(word.text)}{guess}")
+            findings.error(word, f"unknown key {quote(word.text)}{guess}")
         elif not is_repeated(word.text, word, first_lines, findings):
             yield entry

@@ -14,7 +14,7 @@ from appliance.policy.host_sets import Atom
 from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
 from appliance.policy.keys import BadKeyError, Key, KeyTree, parse_key, ties
 from appliance.policy.model import Rule
-from appliance.policy.policy_findings import Findings, Place, quoted
+from appliance.policy.policy_findings import Findings, Place, quote
 from appliance.policy.sections import DEFAULT, LIMITS
 
 
@@ -128,7 +128,7 @@ def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key
     try:
         key = parse_key(word.text, parameter=False)
     except BadKeyError as fault:
-        findings.error(word, f"{quoted(word.text)}: {fault}")
+        findings.error(word, f"{quote(word.text)}: {fault}")
         return None
     return None if not key.exact and ties(key, word, patterns, findings) else key
 
@@ -142,7 +142,7 @@ def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[C
             parts[-1][1].append(word)
         else:
             guess = meant(word.text, _PARTS) or ", such as publisher 30 Hz 10 MB/s"
-            text = f"a limit begins with publisher, subscriber or topic, not {quoted(word.text)}{guess}"
+            text = f"a limit begins with publisher, subscriber or topic, not {quote(word.text)}{guess}"
             findings.error(word, text)
             return
     if not parts:
@@ -178,7 +178,7 @@ def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
         word = words.pop(0)
         number = _NUMBER.fullmatch(word.text)
         if number is None:
-            findings.error(word, f"{quoted(word.text)}: put hosts before the numbers")
+            findings.error(word, f"{quote(word.text)}: put hosts before the numbers")
             return None
         unit = number[2] or (words.pop(0).text if words else "")
         fault = _fault(float(number[1]), _FOLDED.get(unit.casefold()), unit, found)

@@ -9,7 +9,7 @@ from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
 from appliance.policy.keys import BadKeyError, Key, command_key, parse_key, ties
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable, place_of
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, quote
 from appliance.policy.sections import ASK, ASKING, DEFAULT, PARAMETERS, Decider
 
 MAXIMUM_INNER_STARS = 1000
@@ -50,9 +50,9 @@ class RuleCompiler:
             if key is not None and not key.exact and not self._fits(category, key, name):
                 continue
             rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
-            shown = f"only {self._groups.shown(plain)} may" if plain else "no host may"
+            shown = f"only {self._groups.to_text(plain)} may" if plain else "no host may"
             if asking:
-                shown += f", and with an approval {self._groups.shown(asking)}"
+                shown += f", and with an approval {self._groups.to_text(asking)}"
             atoms, asked_atoms = (frozenset(atom for _, atom in some) for some in (words, asked))
             place = place_of(rule)
             self._add(
@@ -99,7 +99,7 @@ class RuleCompiler:
         category = next((category for category in decider.categories if category.value == verb), None)
         if category is None or not name:
             text = "a key here is read or write and a name, such as read /ns/** or write default"
-            self._findings.error(entry.key, f"{quoted(entry.key.text)}: {text}")
+            self._findings.error(entry.key, f"{quote(entry.key.text)}: {text}")
             return None
         return category, Word(entry.key.line, entry.key.column + len(verb) + 1, name)
 
@@ -112,9 +112,9 @@ class RuleCompiler:
             return parse_key(name.text, parameter=category in PARAMETERS)
         except BadKeyError as fault:
             if meant(name.text, [DEFAULT]) and not name.text.startswith("/"):
-                self._findings.error(name, f"{quoted(name.text)}: did you mean default?")
+                self._findings.error(name, f"{quote(name.text)}: did you mean default?")
             else:
-                self._findings.error(name, f"{quoted(name.text)}: {fault}")
+                self._findings.error(name, f"{quote(name.text)}: {fault}")
             return None
 
     def _command(self, name: Word) -> Key | None:
@@ -125,9 +125,9 @@ class RuleCompiler:
             self._findings.error(name, f"can never match: {name.text} is decided by {elsewhere}, not here")
         elif "*" in name.text:
             self._findings.error(
-                name, f"{quoted(name.text)}: commands have no patterns; default matches all other commands"
+                name, f"{quote(name.text)}: commands have no patterns; default matches all other commands"
             )
         else:
             guess = meant(name.text, [*commands.COMMANDS, *commands.DECIDED_ELSEWHERE, DEFAULT])
-            self._findings.error(name, f"unknown command {quoted(name.text)}{guess}")
+            self._findings.error(name, f"unknown command {quote(name.text)}{guess}")
         return None

@@ -59,7 +59,7 @@ class Bounds:
                 f"{self}: the quota of a host, or of unknown hosts and the kept part together, exceeds the whole"
             )
 
-    def sized(self, whole: int, host: int | None = None) -> "Bounds":
+    def resize(self, whole: int, host: int | None = None) -> "Bounds":
         """Return bounds with the operator's `whole` and `host` (None: scaled with `whole`).
 
         A nonzero `unknown` stays at least one, so that a small pool can still tell an unknown host the reason of a

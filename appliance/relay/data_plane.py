@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
-from appliance.relay.connections.headers import kept
+from appliance.relay.connections.headers import peer_fields
 from appliance.relay.connections.incoming_connection import (
     IncomingConnection,
     PendingConnections,
@@ -481,9 +481,9 @@ class DataPlane:
             asked = (kind, incoming.key, name, incoming.host, fields.get("callerid", ""))
             self._refuse(asked, sock, reason)
         elif "topic" in fields:
-            self._subscribe(incoming, sock, kept(fields))
+            self._subscribe(incoming, sock, peer_fields(fields))
         else:
-            self._serve_client(incoming, sock, kept(fields), rest)
+            self._serve_client(incoming, sock, peer_fields(fields), rest)
 
     def _recheck_waiting(self, message: messages.RelayFact) -> None:
         hosts = self.waiting[message.key]
@@ -584,7 +584,7 @@ class DataPlane:
         longest, row = topic.counters.longest / 1e9, topic.traffic()
         if row is not None and row.delays and (judges := self.interceptor.judges(topic.topic)):
             what = f"a message of {topic.topic}"
-            self.interceptor.observer.timed(judges, what, sum(row.delays), longest, late=0)
+            self.interceptor.observer.count_times(judges, what, sum(row.delays), longest, late=0)
         return row
 
     def _tick(self) -> None:
@@ -599,5 +599,5 @@ class DataPlane:
                 return
         self._calls.own.tidy()
         self.interceptor.tick()
-        self._reporter.tick(self._rows, self.memory.held())
+        self._reporter.tick(self._rows, self.memory.bytes_held())
         self._loop.after(self._limits.report_every, self._tick)

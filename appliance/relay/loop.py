@@ -243,7 +243,7 @@ class EventLoop:
         """
         return _WorkThread(self, work, done)
 
-    def used(self) -> int:
+    def time_used(self) -> int:
         """Return the running handler's processor time (ns), or the time since the first call if it is unknown."""
         now = self._processor_time()
         if self._since == _UNKNOWN:
@@ -251,7 +251,7 @@ class EventLoop:
         return now - self._since
 
     def over(self) -> bool:
-        return self.used() >= QUANTUM
+        return self.time_used() >= QUANTUM
 
     def charge(self, payer: str, used: int) -> None:
         """Charge a payer in addition to the payer of the running handler.

@@ -17,7 +17,7 @@ from appliance.relay.connections.message_sink import OpenSink
 from appliance.relay.data_plane import DataPlane
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.state_keeper import StateKeeper
-from appliance.relay.monitors.state_memory import mapped
+from appliance.relay.monitors.state_memory import map_memory
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.transport.loop_channel import LoopLink
 from appliance.relay.transport.sockets import congestion_control
@@ -41,7 +41,7 @@ class RelayProcess:
     def __init__(self, lifeline: socket.socket, index: int, limits: RelayLimits) -> None:
         self._index = index
         self._descriptors = _raise_descriptor_limit(descriptors_for(limits.connections))
-        self._limits = limits = fitted(limits, self._descriptors)
+        self._limits = limits = fit_limits(limits, self._descriptors)
         self._loop = EventLoop()
         self._engine = DataPlane(self._loop, limits)
         self._lifeline = LoopLink(
@@ -83,12 +83,12 @@ class RelayProcess:
         elif isinstance(message, messages.HeartbeatGiven) and message.line:
             self._engine.heartbeat.use_line(descriptors[0])
         elif isinstance(message, messages.HeartbeatGiven):
-            self._engine.heartbeat.share(mapped(descriptors[0], writable=True), self._index)
+            self._engine.heartbeat.share(map_memory(descriptors[0], writable=True), self._index)
         else:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
 
     def _keep_state(self, given: messages.StateGiven, descriptor: int) -> None:
-        memory = mapped(descriptor, writable=given.own)
+        memory = map_memory(descriptor, writable=given.own)
         if given.own:
             self._engine.interceptor.remember(StateKeeper(given, memory, self._earlier))
             self._earlier = []
@@ -118,7 +118,7 @@ def descriptors_for(connections: int) -> int:
     return 2 * connections + _DESCRIPTORS_BESIDE
 
 
-def fitted(limits: RelayLimits, descriptors: int) -> RelayLimits:
+def fit_limits(limits: RelayLimits, descriptors: int) -> RelayLimits:
     """Return limits with no more connections than descriptors permit, so that surplus peers are refused."""
     possible = max(1, (descriptors - _DESCRIPTORS_BESIDE) // 2)
     if possible >= limits.connections:

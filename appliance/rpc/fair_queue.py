@@ -166,7 +166,7 @@ class Bulk:
     async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         used = 0.0
 
-        def measured() -> T:
+        def measure() -> T:
             nonlocal used
             since = time.thread_time()
             try:
@@ -175,7 +175,7 @@ class Bulk:
                 used = time.thread_time() - since
 
         try:
-            return await asyncio.to_thread(measured)
+            return await asyncio.to_thread(measure)
         finally:
             self._processor.charge_beside(self._host, used)
 

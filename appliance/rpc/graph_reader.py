@@ -97,10 +97,10 @@ class _Survey:
             self._master, timeout=self._limits.call, pool=self._limits.at_once, limits=_LIMITS
         )
         try:
-            state = await self._asked(master, "getSystemState")
+            state = await self._ask(master, "getSystemState")
             protected = await self._is_appliance(master)
-            types = dict(_pairs(await self._asked(master, "getTopicTypes")))
-            parameters = _names(await self._asked(master, "getParamNames"))
+            types = dict(_pairs(await self._ask(master, "getTopicTypes")))
+            parameters = _names(await self._ask(master, "getParamNames"))
             publishers, subscribers, services = (
                 {_text(row[0]): _names(row[1]) for row in _rows(part, 2)} for part in _parts(state, 3)
             )
@@ -157,7 +157,7 @@ class _Survey:
         answer = await self._answer(client, "getBusStats")
         return answer[2] if isinstance(answer, list) and len(answer) == 3 else answer
 
-    async def _asked(self, client: XmlRpcClient, method: str, *parameters: Value) -> Value:
+    async def _ask(self, client: XmlRpcClient, method: str, *parameters: Value) -> Value:
         """Return the value of an answer. Raises `CallFailedError`."""
         answer = await self._answer(client, method, *parameters)
         if not (isinstance(answer, list) and len(answer) == 3 and answer[0] == 1):
@@ -175,7 +175,7 @@ class _Survey:
 
     async def _is_appliance(self, master: XmlRpcClient) -> bool:
         try:
-            ports = await self._asked(master, "getRVState")
+            ports = await self._ask(master, "getRVState")
         except CallFailedError as error:
             return isinstance(error, _DeniedError)
         return isinstance(ports, list) and len(ports) == 3
@@ -221,7 +221,7 @@ class _Survey:
         uri = ""
         try:
             async with self._turns:
-                uri = _text(await self._asked(master, "lookupNode", name))
+                uri = _text(await self._ask(master, "lookupNode", name))
             place = parse_node_uri(uri)
         except (CallFailedError, InvalidUriError) as error:
             return SurveyedNode(name, uri, problem=str(error)), None
@@ -232,8 +232,8 @@ class _Survey:
             replace(place, host=self._addresses[place.host]), timeout=self._limits.call, limits=_LIMITS
         )
         try:
-            pid = await self._asked(client, "getPid")
-            bus = _rows(await self._asked(client, "getBusInfo"), 5)[: self._limits.rows]
+            pid = await self._ask(client, "getPid")
+            bus = _rows(await self._ask(client, "getBusInfo"), 5)[: self._limits.rows]
             before, began = _sent(await self._counts(client)), clock.now()
             if before:
                 await asyncio.sleep(self._limits.sample)
@@ -254,7 +254,7 @@ class _Survey:
             uri = ""
             with suppress(CallFailedError):  # it has ended since
                 async with self._turns:
-                    uri = _text(await self._asked(master, "lookupService", name))
+                    uri = _text(await self._ask(master, "lookupService", name))
             return SurveyedService(name, providers[name], uri)
 
         return tuple(await asyncio.gather(*map(one, names)))

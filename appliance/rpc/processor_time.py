@@ -48,7 +48,7 @@ class Line(Generic[Key, Item]):
     def __len__(self) -> int:
         return sum(map(len, self.queues.values()))
 
-    def used(self, key: Key) -> float:
+    def time_used(self, key: Key) -> float:
         used, start = self._used.get(key, self.start), self.start
         return used if used > start else start
 
@@ -68,7 +68,7 @@ class Line(Generic[Key, Item]):
         queue = self.queues.get(key)
         if queue is None:
             self.queues[key] = deque([item])
-            heapq.heappush(self._order, (self.used(key), next(self._numbers), key))
+            heapq.heappush(self._order, (self.time_used(key), next(self._numbers), key))
         else:
             queue.append(item)
 
@@ -76,7 +76,7 @@ class Line(Generic[Key, Item]):
         order = self._order
         while True:
             stored, _, key = order[0]
-            used = self.used(key)
+            used = self.time_used(key)
             if stored >= used:
                 break
             heapq.heapreplace(order, (used, next(self._numbers), key))

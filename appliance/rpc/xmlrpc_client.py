@@ -69,7 +69,7 @@ class XmlRpcClient:
 
     async def call(self, method: str, *params: Value) -> Value:
         """Make a call. Raises `CallFailedError`, even if the peer is slow, silent or misbehaves."""
-        body = await self._written(method, params)
+        body = await self._encode(method, params)
         request = b"%b%d\r\n\r\n%b" % (self.head, len(body), body)  # no format has a path of the peer
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
         try:
@@ -100,7 +100,7 @@ class XmlRpcClient:
         transport.close()
         return True
 
-    async def _written(self, method: str, params: tuple[Value, ...]) -> bytes:
+    async def _encode(self, method: str, params: tuple[Value, ...]) -> bytes:
         if weigh(list(params), _OFFLOAD) < _OFFLOAD:
             return build_call(method, params)
         return await asyncio.to_thread(build_call, method, params)

@@ -115,7 +115,7 @@ def remembered_logs(folder: Path, opened: Open = plainly) -> list[RememberedLog]
     unlisted = [
         IndexedLog(log, 0) for log in stems if log not in known
     ]  # by an earlier version, or before a crash
-    return [_remembered(folder, entry, opened) for entry in [*index, *unlisted]]
+    return [_remember(folder, entry, opened) for entry in [*index, *unlisted]]
 
 
 def read_index(folder: Path, opened: Open = plainly) -> list[IndexedLog]:
@@ -149,7 +149,7 @@ def others(logs: list[RememberedLog], present: str) -> list[OtherLog]:
     ]
 
 
-def _remembered(folder: Path, entry: IndexedLog, opened: Open) -> RememberedLog:
+def _remember(folder: Path, entry: IndexedLog, opened: Open) -> RememberedLog:
     first, last, digest = _memory(folder / f"{entry.log}.signed", opened)
     content = _read(folder / f"{entry.log}.acknowledged", opened, _LARGEST)
     known = None if content is None else msgspec.json.decode(content, type=Acknowledgement)

@@ -40,7 +40,7 @@ class ChangeRecords:
     def __init__(self, trail: AuditTrail) -> None:
         self._trail = trail
 
-    def loaded(
+    def record_load(
         self,
         row: MonitorRevisionRow,
         before: Sources,
@@ -60,9 +60,9 @@ class ChangeRecords:
             resource="",
             who=who,
             revision_of_specifications=row.revision,
-            sha256=fingerprint_of_all(new.sources.named()),
-            earlier_sha256=fingerprint_of_all(before.named()) if before.files else "",
-            diff=changed_lines(before.named(), new.sources.named()),
+            sha256=fingerprint_of_all(new.sources.by_name()),
+            earlier_sha256=fingerprint_of_all(before.by_name()) if before.files else "",
+            diff=changed_lines(before.by_name(), new.sources.by_name()),
             compiled_sha256=fingerprint(checked.compiled),
             monitors=list(checked.monitors),
             off=off_in(new),
@@ -75,7 +75,7 @@ class ChangeRecords:
             warnings=[*checked.warnings, *warnings][:MAX_WARNINGS],
         )
 
-    def refused(self, revision: int, reason: str, findings: Sequence[str], who: str) -> None:
+    def record_refusal(self, revision: int, reason: str, findings: Sequence[str], who: str) -> None:
         text = f"revision {revision} stays in force: {reason}"
         self._trail.happened("specifications refused", text, findings=findings[:_MAX_FINDINGS], who=who)
 
@@ -92,7 +92,7 @@ class ChangeRecords:
             who=DISK,
         )
 
-    def confirmed(self, revision: int, promoted: Sequence[str], who: str) -> None:
+    def record_confirmation(self, revision: int, promoted: Sequence[str], who: str) -> None:
         also = f": {', '.join(promoted)} in force" if promoted else ""
         self._trail.happened(
             "specifications confirmed",
@@ -117,7 +117,7 @@ class ChangeRecords:
         fix = f"load a version without the error: rosrv monitor load {file}"
         self._trail.happened("monitor not built", f"{text}; {fix}", category="monitor", resource=file)
 
-    def switched(
+    def record_switch(
         self, name: str, to: Switch, who: str, why: str, *, earlier: Switch | None, until: float | None
     ) -> None:
         """Record a switch; `earlier` is None for a monitor that was not loaded."""
@@ -133,11 +133,11 @@ class ChangeRecords:
             more=None if until is None else {"until": _moment(until)},
         )
 
-    def resumed(self, name: str, who: str) -> None:
+    def record_resume(self, name: str, who: str) -> None:
         text = f"the topics of {name} are released"
         self._trail.happened("monitor resumed", text, category="monitor", resource=name, who=who)
 
-    def given(
+    def record_values(
         self, name: str, states: Mapping[str, GivenState], before: Mapping[str, GivenValue], who: str
     ) -> None:
         parts = [
@@ -155,7 +155,7 @@ class ChangeRecords:
             before=dict(before),
         )
 
-    def dropped(self, value: DroppedValue, who: str) -> None:
+    def record_drop(self, value: DroppedValue, who: str) -> None:
         """Record that a specification no longer takes a value that was given."""
         self._trail.happened(
             "monitor set",

@@ -16,7 +16,7 @@ from appliance.specifications.specification_files import (
     require_bounded,
 )
 from rosmop.check.sources import compiled_from
-from rosmop.fast.build import certified, parts_of, require_loadable
+from rosmop.fast.build import certify, parts_of, require_loadable
 from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
@@ -51,11 +51,11 @@ def contents(
     monitors of the files in `unbuilt` do nothing. Without `lints`, only errors are found.
     """
     try:
-        definitions = _standard().extended(Definitions.from_files(texts))
+        definitions = _standard().merge(Definitions.from_files(texts))
         monitors = MonitorSet.of(
             compiled_from(files, definitions, lints=lints, without_code=unbuilt, topics=given_topics)
         )
-        certificates, data = certified(monitors.compiled)
+        certificates, data = certify(monitors.compiled)
         if load:
             require_loadable(data)
         if not at_start:

@@ -74,7 +74,7 @@ class SpecificationCompiler:
     async def check(
         self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
     ) -> CheckedSpecifications:
-        return await self._checked(sources, site_keys, broken)
+        return await self._check(sources, site_keys, broken)
 
     async def check_at_start(
         self, sources: Sources, site_keys: Sequence[str], known: Sequence[str] | None = None
@@ -83,10 +83,10 @@ class SpecificationCompiler:
 
         `known` are the warnings that were found when these sources were loaded; they are not looked for again.
         """
-        checked = await self._checked(sources, site_keys, (), at_start=True, lints=known is None)
+        checked = await self._check(sources, site_keys, (), at_start=True, lints=known is None)
         return checked if known is None else msgspec.structs.replace(checked, warnings=tuple(known))
 
-    async def _checked(
+    async def _check(
         self,
         sources: Sources,
         site_keys: Sequence[str],
@@ -98,7 +98,7 @@ class SpecificationCompiler:
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
-        question = _wanted(sources, broken, at_start=at_start, lints=lints)
+        question = _question(sources, broken, at_start=at_start, lints=lints)
         if at_start:
             answer = await self._ask_once(question, messages.ContentsFound)
         else:
@@ -115,8 +115,8 @@ class SpecificationCompiler:
             await self._no_order.wait()
             self._dry_run = True
             try:
-                answer = await self._asked(
-                    _wanted(sources, broken, dry_run=True),
+                answer = await self._ask(
+                    _question(sources, broken, dry_run=True),
                     messages.ContentsFound,
                     goes_on=lambda: not self._orders,
                 )
@@ -154,7 +154,7 @@ class SpecificationCompiler:
 
     async def _ordered(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
         with self._order():
-            return await self._asked(question, kind)
+            return await self._ask(question, kind)
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
@@ -169,7 +169,7 @@ class SpecificationCompiler:
             if not self._orders:
                 self._no_order.set()
 
-    async def _asked(
+    async def _ask(
         self,
         question: Callable[[int], messages.Message],
         kind: type[M],
@@ -217,7 +217,7 @@ class SpecificationCompiler:
             self._link.answered(message.number, message)
 
 
-def _wanted(
+def _question(
     sources: Sources,
     broken: Sequence[str],
     *,

@@ -58,7 +58,7 @@ class Givens:
         }
         return {monitor: values for monitor, values in found.items() if values}
 
-    def dropped(self, checked: CheckedSpecifications) -> list[DroppedValue]:
+    def dropped_values(self, checked: CheckedSpecifications) -> list[DroppedValue]:
         kept = self.in_force(checked)
         own = {monitor: {row.name: row.value for row in rows} for monitor, rows in checked.givens.items()}
         return [
@@ -73,7 +73,7 @@ class Givens:
         return [replace(one, value=said.get(one.name, one.value)) for one in checked.givens.get(monitor, ())]
 
 
-def parsed(
+def parse(
     declared: tuple[GivenState, ...], monitor: str, values: Mapping[str, GivenValue]
 ) -> dict[str, GivenValue]:
     """Return the values to set. Raises `SpecificationsRefusedError` with all errors."""

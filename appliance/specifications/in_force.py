@@ -11,7 +11,7 @@ import msgspec
 
 from appliance.base.actors import DISK
 from appliance.channel.messages import GivenValue
-from appliance.specifications.givens import DroppedValue, Given, Givens, parsed, require_topics
+from appliance.specifications.givens import DroppedValue, Given, Givens, parse, require_topics
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -123,12 +123,12 @@ class Coming(NamedTuple):
     given: Given
 
 
-def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed: bool) -> Coming:
+def load(now: InForce, order: Order, checked: CheckedSpecifications, *, signed: bool) -> Coming:
     """Return the next revision. With `signed`, the site signs the texts."""
     constants, before = constants_of(order, checked, signed=signed), now
     waiting = now.back_to is not None and not order.settled
     if order.undoes:
-        now = _undone(now, order, checked)
+        now = _undo(now, order, checked)
     present = {name: to for name, to in now.states.items() if name in checked.switches}
     said = {**_absent(now, order.switches), **present, **now.switches.said}
     new = InForce(
@@ -147,14 +147,14 @@ def loaded(now: InForce, order: Order, checked: CheckedSpecifications, *, signed
     ordered = put.keys() | {f"{name}.{constant}" for name, given in constants.items() for constant in given}
     since = now.since - ordered if waiting else frozenset[str]()
     new = replace(new, switches=new.switches.saying({**said, **put}), since=since)
-    enabled = {name: True for name in checked.monitors if now.switches.enabled(name)}
+    enabled = {name: True for name in checked.monitors if now.switches.is_enabled(name)}
     if order.undoes:
-        return _with_differences(cleared(new), before)
+        return _with_differences(clear(new), before)
     require_whole({**new.states, **enabled, **put}, checked)
-    return cleared(new)._replace(put=put, given=constants)
+    return clear(new)._replace(put=put, given=constants)
 
 
-def _undone(now: InForce, order: Order, checked: CheckedSpecifications) -> InForce:
+def _undo(now: InForce, order: Order, checked: CheckedSpecifications) -> InForce:
     """Return the value with the texts and words of an order, but for what ends automatically or was ordered since."""
     former = now.switches.saying(order.switches).of(checked).states
     returns = dict(now.returns)
@@ -194,7 +194,7 @@ def _with_differences(coming: Coming, before: InForce) -> Coming:
     return coming._replace(put=put, given={name: values for name, values in given.items() if values})
 
 
-def switched(
+def switch(
     now: InForce, names: Collection[str], to: Switch, *, timed: bool = False, due: bool = False
 ) -> InForce:
     """Return the value after a switch. A `timed` switch returns to the one before all timed ones, when it is `due`."""
@@ -209,22 +209,22 @@ def switched(
     return replace(now, switches=switches, acts=now.acts + 1, returns=returns, since=since)
 
 
-def confirmed(now: InForce) -> InForce:
+def confirm(now: InForce) -> InForce:
     returns = {name: one for name, one in now.returns.items() if one.of is not True}
     return replace(now, returns=returns, back_to=None)
 
 
-def given(now: InForce, name: str, values: Mapping[str, GivenValue]) -> InForce:
+def give(now: InForce, name: str, values: Mapping[str, GivenValue]) -> InForce:
     since = now.since | {f"{name}.{constant}" for constant in values}
     return replace(now, givens=now.givens.giving({name: values}), acts=now.acts + 1, since=since)
 
 
-def cleared(new: InForce) -> Coming:
+def clear(new: InForce) -> Coming:
     """Forget the words about monitors and values that these specifications do not have."""
     said = {name: to for name, to in new.switches.said.items() if name in new.checked.monitors}
     drawn_in = [name for name, to in new.states.items() if to == SHADOW and new.switches.own(name) != SHADOW]
     switches = new.switches.saying({**said, **dict.fromkeys(drawn_in, SHADOW)})
-    dropped, givens = new.givens.dropped(new.checked), Givens(new.givens.in_force(new.checked))
+    dropped, givens = new.givens.dropped_values(new.checked), Givens(new.givens.in_force(new.checked))
     returns = {name: one for name, one in new.returns.items() if new.states.get(name) == one.of}
     now = replace(new, switches=switches, givens=givens, returns=returns)
     return Coming(now, drawn_in, dropped, {}, {})
@@ -240,7 +240,7 @@ def constants_of(
     if unknown:
         raise SpecificationsRefusedError([unknown_monitors(unknown, checked)])
     return {
-        name: parsed(checked.givens.get(name, ()), name, values) for name, values in order.constants.items()
+        name: parse(checked.givens.get(name, ()), name, values) for name, values in order.constants.items()
     }
 
 

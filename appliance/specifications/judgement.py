@@ -32,7 +32,7 @@ class Judge:
         self._held = held
         self._moved = moved
 
-    def judged(
+    def judge(
         self,
         now: InForce,
         coming: InForce,
@@ -45,17 +45,17 @@ class Judge:
         cut = judge_topics(
             coming.checked, now.checked, self._live(), shadow=shadow, forced=consent.force, promoted=promoted
         )
-        held = self.held(now, coming, shadow, hold=consent.hold)
+        held = self.holds(now, coming, shadow, hold=consent.hold)
         if cut.conflicts or held.conflicts:
             raise SpecificationsRefusedError([*cut.conflicts, *held.conflicts, *cut.warnings, *held.warnings])
         return cut.warnings + held.warnings
 
-    def held(self, now: InForce, coming: InForce, shadow: Collection[str], *, hold: bool) -> TopicFindings:
+    def holds(self, now: InForce, coming: InForce, shadow: Collection[str], *, hold: bool) -> TopicFindings:
         """Judge the topics with traffic that the monitors of a value would hold."""
         acting = {
             name
             for name, state in coming.states.items()
-            if now.switches.enabled(name) and state and name not in shadow
+            if now.switches.is_enabled(name) and state and name not in shadow
         }
         return judge_holds(
             coming.checked,
@@ -71,10 +71,10 @@ async def beside_broken(
     now: InForce, check: CheckBeside, site_keys: Sequence[str], sources: Sources, loaded: Collection[str] = ()
 ) -> CheckedSpecifications:
     """Let files that have done nothing since the start, because of an error, remain so unless they are `loaded`."""
-    present, following = now.sources.named(), sources.named()
+    present, following = now.sources.by_name(), sources.by_name()
     errors = {
         file: error
-        for file, error in broken(now).items()
+        for file, error in broken_files(now).items()
         if file not in loaded and following.get(file) == present.get(file)
     }
     try:
@@ -88,7 +88,7 @@ async def beside_broken(
     return msgspec.structs.replace(checked, left_out=left_out, warnings=(*checked.warnings, *warnings))
 
 
-def broken(now: InForce) -> dict[str, str]:
+def broken_files(now: InForce) -> dict[str, str]:
     """Return the files that do nothing, because they have an error."""
     unbuilt = {now.checked.monitors[name]: error for name, error in now.checked.unbuilt.items()}
     return now.checked.left_out | unbuilt

@@ -158,7 +158,7 @@ class Repetitions:
         known.count = 0
         return event
 
-    def ended(self, now: float) -> Iterator[tuple[MonitorEvent, dict[str, float]]]:
+    def pop_ended(self, now: float) -> Iterator[tuple[MonitorEvent, dict[str, float]]]:
         """Yield the last reports of actions that have ended, and their whole number (`total`) and time in seconds."""
         for key, known in list(self._known.items()):
             quiet = now - known.at >= QUIET
@@ -248,12 +248,12 @@ class Stops:
         self.last[event.monitor] = found
         return found
 
-    def recorded(self, stop: StoppedTopic, record: str) -> None:
+    def note_record(self, stop: StoppedTopic, record: str) -> None:
         going = self._going[stop.monitor, stop.topic]
         going.stop = self.last[stop.monitor] = msgspec.structs.replace(going.stop, record=record)
         self._keep(self.going())
 
-    def ended(self, now: float) -> list[StoppedTopic]:
+    def pop_ended(self, now: float) -> list[StoppedTopic]:
         ended = [key for key, going in self._going.items() if now - going.at >= going.quiet]
         stops = [self._going.pop(key).stop for key in ended]
         if stops:
@@ -325,9 +325,9 @@ class MonitorRecords:
 
     def tick(self) -> None:
         now = clock.now()
-        for event, whole in self.repetitions.ended(now):
+        for event, whole in self.repetitions.pop_ended(now):
             self._record(event, whole)
-        for stop in self.stops.ended(now):
+        for stop in self.stops.pop_ended(now):
             seconds = (stop.until - stop.since) / 1e9
             text = f"{stop.monitor} stopped {stop.topic} for {seconds:.1f} s, {counted(stop.count, 'time')}"
             self._say_ended(stop, f"{text}: {stop.cause}" if stop.cause else text, seconds=round(seconds, 3))
@@ -378,7 +378,7 @@ class MonitorRecords:
         if stop is not None:
             cause = stop.cause or "its conditions are in the record"
             begun = msgspec.structs.replace(event, text=f"{stop.monitor} stops {stop.topic}: {cause}")
-            self.stops.recorded(stop, self._record(begun))
+            self.stops.note_record(stop, self._record(begun))
 
     def _record(self, event: MonitorEvent, whole: Mapping[str, float] = MappingProxyType({})) -> str:
         name, severity = _STOP if event.safe else _EVENTS.get(event.kind, ("monitor log", Severity.INFO))

@@ -82,7 +82,7 @@ class Sources(msgspec.Struct, frozen=True):
             raise SpecificationsRefusedError([*unsigned.values()])
         return sorted(found)
 
-    def signed(self, site_keys: Sequence[str]) -> tuple["Sources", dict[str, str]]:
+    def signed_only(self, site_keys: Sequence[str]) -> tuple["Sources", dict[str, str]]:
         _, errors = self._signed(site_keys)
         files, definitions = (
             {name: text for name, text in texts.items() if folder + name not in errors}
@@ -105,7 +105,7 @@ class Sources(msgspec.Struct, frozen=True):
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
         """Return the added, changed and removed names; a definition is `msg/package/Type.msg`."""
-        old, new = before.named(), self.named()
+        old, new = before.by_name(), self.by_name()
         return (
             [name for name in new if name not in old],
             [name for name in new if name in old and old[name] != new[name]],
@@ -117,7 +117,7 @@ class Sources(msgspec.Struct, frozen=True):
         files = {name: without_file_switch(text) for name, text in self.files.items()}
         return msgspec.structs.replace(self, files=files)
 
-    def named(self) -> dict[str, str]:
+    def by_name(self) -> dict[str, str]:
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
 
 
@@ -192,7 +192,7 @@ def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[s
     Raises `SpecificationsRefusedError`.
     """
     found, errors = _read_folder(folder)
-    sources, unsigned = found.signed(site_keys)
+    sources, unsigned = found.signed_only(site_keys)
     longer = {name: _too_long(name) for name, text in sources.files.items() if len(text) > _LONGEST_FILE}
     return sources.without({*longer}), errors | unsigned | longer
 

@@ -37,9 +37,9 @@ from appliance.channel.answers.monitor_answers import Replaced, Switched, findin
 from appliance.specifications import in_force
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.change_records import ChangeRecords, off_in
-from appliance.specifications.givens import Givens, parsed, split
+from appliance.specifications.givens import Givens, parse, split
 from appliance.specifications.in_force import Coming, Consent, InForce, Order, Return, unknown_monitors
-from appliance.specifications.judgement import Judge, beside_broken, broken, in_shadow
+from appliance.specifications.judgement import Judge, beside_broken, broken_files, in_shadow
 from appliance.specifications.live_topics import Published
 from appliance.specifications.monitor_values import MonitorValues
 from appliance.specifications.records import MonitorRecords
@@ -184,7 +184,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             kept=self.in_force if self.revision else None,
         )
         before, row = self.now, self.in_force
-        coming = in_force.cleared(replace(before, sources=sources, checked=checked))
+        coming = in_force.clear(replace(before, sources=sources, checked=checked))
         if last is None:  # the folder was read
             why = refused[0] if refused else ""
             coming = coming._replace(now=replace(coming.now, folder_refused=why))
@@ -292,7 +292,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self.checked.monitors[name]
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        rows = [self.described(row) for row in await self.rows()]
+        rows = [self.describe(row) for row in await self.rows()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
@@ -302,9 +302,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 f"there is no revision {request.revision} of the specifications: rosrv monitor revisions lists all"
             )
         texts = msgspec.structs.asdict(sources_of(row))
-        return msgspec.convert(self.described(row) | texts, answers.RevisionTexts)
+        return msgspec.convert(self.describe(row) | texts, answers.RevisionTexts)
 
-    async def shown(self, request: admin.MonitorValuesWanted, who: str) -> answers.MonitorReadout:
+    async def show_values(self, request: admin.MonitorValuesWanted, who: str) -> answers.MonitorReadout:
         """Return the variables of a monitor. Raises `UnknownMonitorError`."""
         self._all_known([request.name])
         return await self.values.of(request.name, who)
@@ -319,9 +319,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """
         async with self.changing(request.expected):
             order = self._loading(request, who, enable=enable)
-            asks = request.shadow or request.given or request.files.keys() & broken(self.now).keys()
+            asks = request.shadow or request.given or request.files.keys() & broken_files(self.now).keys()
             if self.in_force.who != DISK and order.sources == self.sources and not asks:
-                return self.replaced(self.revision, loaded=order.loaded)  # same texts: no new revision
+                return self.replacement(self.revision, loaded=order.loaded)  # same texts: no new revision
             return await self._change(order, self._beside(self._check, order.loaded))
 
     async def attempt(self, asked: admin.MonitorTry, who: str) -> Replaced:
@@ -336,7 +336,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._attempting.add(who)
         try:
             check = self._beside(self._try_out, order.loaded)
-            coming, warnings = await self._judged(before, order, check)
+            coming, warnings = await self._judge(before, order, check)
         finally:
             self._attempting.discard(who)
         added, changed, removed = order.sources.difference(before.sources)
@@ -396,8 +396,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 sources = self.sources.with_files(sources)
             keeper = who if kept else DISK  # with `DISK`, the next start would read only the folder
             same = sources == self.sources and (self.in_force.who == DISK) == (keeper == DISK)
-            if same and not broken(self.now):
-                return self.replaced(self.revision, kept=kept)
+            if same and not broken_files(self.now):
+                return self.replacement(self.revision, kept=kept)
             added, changed, _removed = sources.difference(self.sources)
             shadow = [*added, *changed] if request.shadow else []
             consent = Consent(request.force, request.hold)
@@ -412,7 +412,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self.changing(expected):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
-                return self.replaced(self.revision)  # same texts: no new revision
+                return self.replacement(self.revision)  # same texts: no new revision
             return await self._change(Order(sources, who, note, consent=Consent(hold=True)), self._strictly)
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
@@ -420,7 +420,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         if sources == self.sources:
             return []
         coming = replace(self.now, sources=sources, checked=await self._strictly(sources))
-        return self.judge.held(self.now, coming, in_shadow(coming), hold=False).conflicts
+        return self.judge.holds(self.now, coming, in_shadow(coming), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str, *, settled: bool = False) -> Replaced:
         """Remove files, or the files of monitors, if no other monitor is in them or uses their variables.
@@ -456,7 +456,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         also brings back switches and constants, except for what operators ordered since.
         """
         async with self.changing(request.expected):
-            row = NOTHING if request.revision == 0 else await self.wanted(request.revision)
+            row = NOTHING if request.revision == 0 else await self.require(request.revision)
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
             check: _Check = (
                 (lambda sources: self._check_at_start(sources, self.site_keys, last.warnings))
@@ -474,8 +474,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             promoted = self.now.promoted
             waited = self.confirm_by is not None or bool(promoted)
             if waited:
-                await self._bring(in_force.confirmed(self.now), tell=())
-                self._change_records.confirmed(self.revision, promoted, who)
+                await self._bring(in_force.confirm(self.now), tell=())
+                self._change_records.record_confirmation(self.revision, promoted, who)
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
@@ -514,8 +514,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise SpecificationsRefusedError([text])
         warnings = []
         if not request.shadow:
-            others = set(self.switches.shadowed()) - set(request.names)
-            warnings = self.judge.judged(
+            others = set(self.switches.shadowed_monitors()) - set(request.names)
+            warnings = self.judge.judge(
                 self.now, self.now, others, Consent(request.force), promoted=request.names
             )
         self._check_limit(request)
@@ -530,7 +530,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         confirmed = [
             name
             for name in request.names
-            if self.switches.enabled(name) and self.until(name, of=True) is None
+            if self.switches.is_enabled(name) and self.until(name, of=True) is None
         ]
         if confirmed:
             text = f"{', '.join(confirmed)} is in force already, so it cannot wait for a confirmation"
@@ -543,7 +543,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def _return_switches(self) -> None:
         """Switch back what is due. Monitors that cannot, as they now share variables with others, are tried again."""
         async with self.changing(None):
-            due = {name: one for name, one in self.now.returns.items() if self.ends.passed(TIMED, name)}
+            due = {name: one for name, one in self.now.returns.items() if self.ends.is_over(TIMED, name)}
             for back in dict.fromkeys(due.values()):
                 names = [name for name, one in due.items() if one == back]
                 who = UNCONFIRMED if back.of is True else "its disabled period is over"
@@ -552,7 +552,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 except SpecificationsRefusedError as error:
                     _log.error("a monitor cannot be switched back yet", monitors=names, error=str(error))
             try:
-                await self.store.settled()
+                await self.store.until_settled()
             except StoreError as error:
                 _log.error("switches that ended are not saved", monitors=[*due], reason=str(error))
 
@@ -576,7 +576,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         ]
         if not changed:
             return changed
-        new = in_force.switched(now, changed, to, timed=seconds is not None, due=due)
+        new = in_force.switch(now, changed, to, timed=seconds is not None, due=due)
         told = [(name, messages.MonitorSwitched(name, to is True)) for name in changed]
         shadow = to == SHADOW or any(map(switches.in_shadow, changed))
         limits = [] if seconds is None else [(TIMED, name, seconds) for name in changed]
@@ -606,7 +606,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                     away.append(name)
                     continue
                 self.rollout.resumed(name)
-                self._change_records.resumed(name, who)
+                self._change_records.record_resume(name, who)
             if away:
                 text = f"{', '.join(away)} not resumed: the relay process is not running; resume when it runs again"
                 raise SpecificationsRefusedError([text])
@@ -618,10 +618,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             name = request.name
             self._all_known([name])
             present = {state.name: state.value for state in self.givens.states(self.checked, name)}
-            new = parsed(self.checked.givens.get(name, ()), name, request.values)
+            new = parse(self.checked.givens.get(name, ()), name, request.values)
             changed = [one for one, value in new.items() if value != present[one]]
             if changed:
-                coming = in_force.given(self.now, name, new)
+                coming = in_force.give(self.now, name, new)
                 values = coming.givens.in_force(coming.checked)[name]
                 await self._bring(coming, tell=[(name, messages.MonitorGiven(name, values))])
                 self._record_given(name, {one: present[one] for one in changed}, who)
@@ -641,7 +641,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def _changed(self, order: Order, check: _Check) -> Replaced:
         before, due = self.now, order.who == UNCONFIRMED
         try:
-            coming, warnings = await self._judged(before, order, check)
+            coming, warnings = await self._judge(before, order, check)
             row = self._row(coming.now, order.author or order.who, order.note)
             limits: list[_Limit] = []
             if order.within is not None:
@@ -651,10 +651,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             others = ", ".join(order.kept)
             hint = [f"not of the folder, and kept: {others} (prune removes them)"] if others else []
             findings = error.findings + hint
-            self._change_records.refused(self.revision, error.findings[0], findings, order.who)
+            self._change_records.record_refusal(self.revision, error.findings[0], findings, order.who)
             raise SpecificationsRefusedError(findings) from error
         except StoreError as error:
-            self._change_records.refused(self.revision, "it cannot be stored", [str(error)], order.who)
+            self._change_records.record_refusal(self.revision, "it cannot be stored", [str(error)], order.who)
             raise
         self._record_cleared(before, coming)
         self._record_loaded(before.sources, order.who, warnings, self.rollout.began(self.names()))
@@ -666,18 +666,18 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             own |= {state.name: state.value for state in before.givens.states(before.checked, name)}
             self._record_given(name, {value: own[value] for value in values}, order.who)
         if due:
-            await self.store.settled()
+            await self.store.until_settled()
         await self.rollout.all_taken()
         began = self.rollout.began(self.names())  # also on relays that took them only now
         files = self.sources.difference(before.sources)
-        done = self.replaced(before.number, files, moved, began, order.kept, loaded=order.loaded)
+        done = self.replacement(before.number, files, moved, began, order.kept, loaded=order.loaded)
         done.warnings.extend(findings_of(warnings))
         return done
 
-    async def _judged(self, before: InForce, order: Order, check: _Check) -> tuple[Coming, list[str]]:
+    async def _judge(self, before: InForce, order: Order, check: _Check) -> tuple[Coming, list[str]]:
         checked = await check(order.sources)
-        coming = in_force.loaded(before, order, checked, signed=bool(self.site_keys))
-        warnings = self.judge.judged(before, coming.now, in_shadow(coming.now), order.consent)
+        coming = in_force.load(before, order, checked, signed=bool(self.site_keys))
+        warnings = self.judge.judge(before, coming.now, in_shadow(coming.now), order.consent)
         places = {name: owner.position for name, owner in checked.states.items()}
         warnings += [f"{places[one.monitor]}: warning: {one.text}" for one in coming.dropped]
         return coming, warnings
@@ -706,7 +706,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 raise StoreError(self._stays(str(error))) from error
         row = row or self.in_force
         moved = await self.rollout.take(new) if tell is None else []
-        if problem := await self._unstored(new, row, limits, wait=not due):
+        if problem := await self._store(new, row, limits, wait=not due):
             if tell is None:
                 await self.rollout.take_back(self.now)
             raise StoreError(self._stays(problem))
@@ -716,7 +716,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self.rollout.tell(name, message)
         return moved
 
-    def replaced(
+    def replacement(
         self,
         before: int,
         files: tuple[list[str], list[str], list[str]] = ([], [], []),
@@ -743,7 +743,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     # --- storing ---
 
-    async def _unstored(
+    async def _store(
         self, new: InForce, row: MonitorRevisionRow, limits: Sequence[_Limit], *, wait: bool
     ) -> str:
         """Store the next value; return why it is not stored. The store has the present one again in that case."""
@@ -805,8 +805,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         text = text_with_warnings(new.sources, new.checked)
         return MonitorRevisionRow(new.number, text, clock.wall(), who, note)
 
-    def described(self, row: MonitorRevisionRow) -> dict[str, Any]:
-        return super().described(row) | {"names": list(sources_of(row).files)}
+    def describe(self, row: MonitorRevisionRow) -> dict[str, Any]:
+        return super().describe(row) | {"names": list(sources_of(row).files)}
 
     # --- records ---
 
@@ -815,14 +815,14 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             why = ": it shares variables with one that is"
             self._say_switched(name, SHADOW, self.in_force.who, why, earlier=before.states.get(name))
         for dropped in coming.dropped:
-            self._change_records.dropped(dropped, self.in_force.who)
+            self._change_records.record_drop(dropped, self.in_force.who)
 
     def _record_loaded(
         self, earlier: Sources, who: str, warnings: Sequence[str] = (), began: Sequence[str] = ()
     ) -> None:
         changed = self.sources.difference(earlier)
         row = self.in_force._replace(note=f"{self.in_force.note}{self.unless_confirmed}")
-        self._change_records.loaded(
+        self._change_records.record_load(
             row, earlier, self.now, who, began=began, changed=changed, warnings=warnings
         )
 
@@ -830,11 +830,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self, name: str, to: Switch, who: str, why: str = "", *, earlier: Switch | None
     ) -> None:
         until = self.until(name) or self.until(name, of=True)
-        self._change_records.switched(name, to, who, why, earlier=earlier, until=until)
+        self._change_records.record_switch(name, to, who, why, earlier=earlier, until=until)
 
     def _record_given(self, name: str, before: Mapping[str, messages.GivenValue], who: str) -> None:
         states = {state.name: state for state in self.givens.states(self.checked, name)}
-        self._change_records.given(name, states, before, who)
+        self._change_records.record_values(name, states, before, who)
 
     # --- messages of relays ---
 

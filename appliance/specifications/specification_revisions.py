@@ -136,7 +136,7 @@ def _without_unusable(
         _, errors = folder.read_usable(site_keys)
     except SpecificationsRefusedError:
         return checked
-    present = sources.named()
+    present = sources.by_name()
     unusable = {name: error for name, error in errors.items() if name not in present}
     return msgspec.structs.replace(checked, left_out={**unusable, **checked.left_out})
 

@@ -47,13 +47,13 @@ class Switches:
     def saying(self, said: Mapping[str, Switch]) -> "Switches":
         return replace(self, said=said)
 
-    def enabled(self, name: str) -> bool:
+    def is_enabled(self, name: str) -> bool:
         return self.states.get(name) is True
 
     def in_shadow(self, name: str) -> bool:
         return self.states.get(name) == SHADOW
 
-    def shadowed(self) -> list[str]:
+    def shadowed_monitors(self) -> list[str]:
         return [name for name, state in self.states.items() if state == SHADOW]
 
     def switched_off(self) -> dict[str, Switch]:

@@ -142,7 +142,7 @@ class Tables:
         return f"DELETE FROM {change.table} WHERE {wanted}", values  # noqa: S608  checked names
 
 
-def joined(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
+def join(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
     """Join consecutive rows of a table with the same second value, because each change delays the loop's thread."""
     if len(changes) == 1:
         yield changes[0]
@@ -199,7 +199,7 @@ class WriteAhead:
                 raise WriteAheadClosedError(errno.EBADF, "the state is already closed", str(self._path))
             yield self._open_descriptor
 
-    def left(self, stored: int) -> LeftBehind:
+    def changes_after(self, stored: int) -> LeftBehind:
         """Return the changes after `stored`. Raises `ValueError` for an intact change that is not known here."""
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)

@@ -8,7 +8,7 @@
 4. A credential is `dated`: it also ends when the system clock shows its date. Only so time off counts on a machine
    whose clock is right only some time after its start. One that is made while the clock is behind the program's own
    files gets its date once the clock is set, or is dated from those files after a restart.
-5. `passed` is exact. The owner of a kind is called soon after an end, and again until it forgets or sets the end.
+5. `is_over` is exact. The owner of a kind is called soon after an end, and again until it forgets or sets the end.
 
 6. An end by the system clock, before the time that was counted, is reported (`when_cut_short`).
 
@@ -122,7 +122,7 @@ class EndTable:
             if end.stored:
                 self._store.forget_end(kind.name, name)
             left = end.at - self._now()
-            if left > _CUT_SHORT and self._left(end) <= 0:
+            if left > _CUT_SHORT and self._time_left(end) <= 0:
                 self._cut_short(kind.name, name, left / _SECOND)
 
     def undo(self, kind: EndKind) -> Callable[[], None]:
@@ -138,15 +138,15 @@ class EndTable:
 
     # --- reading ends ---
 
-    def passed(self, kind: EndKind, name: str) -> bool:
+    def is_over(self, kind: EndKind, name: str) -> bool:
         """Whether the end has passed, or none is set: a thing whose end is lost is over."""
         end = self._ends.get(kind.name, {}).get(name)
-        return end is None or self._left(end) <= 0
+        return end is None or self._time_left(end) <= 0
 
-    def left(self, kind: EndKind, name: str) -> float | None:
+    def time_left(self, kind: EndKind, name: str) -> float | None:
         """Return the seconds until the end, 0 after it, or None if none is set."""
         end = self._ends.get(kind.name, {}).get(name)
-        return None if end is None else max(0.0, self._left(end) / _SECOND)
+        return None if end is None else max(0.0, self._time_left(end) / _SECOND)
 
     def date(self, kind: EndKind, name: str) -> float | None:
         """Return the end in seconds since the epoch by the present system clock, for people."""
@@ -168,7 +168,7 @@ class EndTable:
 
     def next_due(self) -> float | None:
         """Return the seconds until the next end, or None without one."""
-        left = [left for end in self._all() if (left := self._left(end)) > 0]
+        left = [left for end in self._all() if (left := self._time_left(end)) > 0]
         return min(left) / _SECOND if left else None
 
     # --- calling the owners ---
@@ -204,7 +204,7 @@ class EndTable:
         self._count_time_off()
         self._date_late()
         for kind, call in self._calls.items():
-            due = [name for name, end in self._ends.get(kind, {}).items() if self._left(end) <= 0]
+            due = [name for name, end in self._ends.get(kind, {}).items() if self._time_left(end) <= 0]
             try:
                 if due:
                     call(due)
@@ -221,8 +221,8 @@ class EndTable:
     def _now(self) -> int:
         return self._age_at_boot + clock.since_boot_ns()
 
-    def _left(self, end: _End) -> int:
-        uncounted = 0 if end.late else self._age.uncounted(end.since)
+    def _time_left(self, end: _End) -> int:
+        uncounted = 0 if end.late else self._age.uncounted_time(end.since)
         left = end.at - self._now() - uncounted
         return left if end.date is None or end.undated else min(left, end.date - clock.wall_ns())
 
@@ -239,7 +239,7 @@ class EndTable:
         """Move the ends that were set while a long time off did not count yet: they began after it."""
         for kind, ends in self._ends.items():
             for name, end in list(ends.items()):
-                if added := self._age.dated(end.since) - end.since:
+                if added := self._age.true_date(end.since) - end.since:
                     self._put(kind, name, end._replace(at=end.at + added, since=self._now()))
 
     def _date_late(self) -> None:

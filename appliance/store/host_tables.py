@@ -169,7 +169,7 @@ class HostTables:
     def forget_awaited(self, name: str) -> None:
         self._database.delete("enrolment_token", name=name)
 
-    def awaited(self) -> list[EnrolmentTokenRow]:
+    def enrolment_tokens(self) -> list[EnrolmentTokenRow]:
         rows = self._database.query("SELECT * FROM enrolment_token")
         return [EnrolmentTokenRow._make((*row[:-2], json.loads(row[-2]), row[-1])) for row in rows]
 
@@ -181,7 +181,7 @@ class HostTables:
             self._database.delete("revocation", serial=serial)
             self._database.delete("revoked_certificate", serial=serial)
 
-    def revoked(self) -> list[RevokedCertificateRow]:
+    def revoked_certificates(self) -> list[RevokedCertificateRow]:
         # Rows of the older table `revoked_certificate` have no expiry: assume the longest life of a certificate.
         rows = self._database.query(
             "SELECT serial, name, moment, expires FROM revocation UNION ALL"

@@ -116,13 +116,13 @@ class Revisions(ABC, Generic[R]):
     async def rows(self) -> list[R]:
         return await asyncio.to_thread(self._rows)
 
-    def described(self, row: R) -> dict[str, Any]:
+    def describe(self, row: R) -> dict[str, Any]:
         return row._asdict() | {"in_force": row.revision == self.revision}
 
     async def find(self, revision: int) -> R | None:
         return next((row for row in await self.rows() if row.revision == revision), None)
 
-    async def wanted(self, revision: int | None) -> R:
+    async def require(self, revision: int | None) -> R:
         """Return a stored revision; None is the revision before the present one. Raises `refusal` and `outdated`."""
         before = self.revision
         known = {row.revision: row for row in await self.rows()}

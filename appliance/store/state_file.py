@@ -164,9 +164,9 @@ class StateStore:
         self._only_in_tree = False  # whether a change waits for the next tree
         self._noted: dict[str, list[int]] = {}  # the changes of each key since the tree was stored, by number
 
-    async def settled(self) -> None:
+    async def until_settled(self) -> None:
         """Wait until the changes are on the disk. Raises `StoreError` if they cannot be written."""
-        await self.database.settled()
+        await self.database.until_settled()
 
     def close(self, seconds: float | None = None) -> None:
         self.database.close(seconds)

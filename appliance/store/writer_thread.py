@@ -1,7 +1,7 @@
 """Write one SQLite file: changes are queued, written in groups by one thread, and can be awaited.
 
 A killed process loses no change: a separate file holds queued changes until the database has them (`ahead`). A
-power failure loses no change that was awaited (`settled`). The table `journal` has the number of the last change,
+power failure loses no change that was awaited (`until_settled`). The table `journal` has the number of the last change,
 so after a crash the database neither repeats nor skips a change. Numbers identify changes within a *history*
 only, which each process begins with its first change, because an earlier process may have passed on changes that
 it then lost in a crash. The changes that a killed process left belong to its own history.
@@ -35,7 +35,7 @@ from appliance.store.changes import (
     Tables,
     Value,
     WriteAhead,
-    joined,
+    join,
 )
 
 _GROUP = 2_000
@@ -188,7 +188,7 @@ class Database:
     def keep(self, changes: list[tuple[Change, bool]]) -> None:
         encoded = [
             (change, ahead, self._encoder.encode(change) if ahead or self._feeds else b"")
-            for change, ahead in joined(changes)
+            for change, ahead in join(changes)
         ]
         with self._order:
             self._require_open()
@@ -255,7 +255,7 @@ class Database:
             why = self._failing or f"{self._path}: {free} bytes are free on its disk, {_ROOM} are wanted"
             raise StoreError(f"{why}; nothing was changed: free space and try again")
 
-    async def settled(self) -> None:
+    async def until_settled(self) -> None:
         """Wait until the changes queued so far are on the disk. Raises `StoreError` if they cannot be written."""
         if problem := await self.unwritten():
             raise StoreError(
@@ -401,7 +401,7 @@ class Database:
         """Apply the changes that a killed process left, before anything is read; return the last number."""
         kept = self._connection.execute("SELECT history, number FROM journal").fetchone()
         number = kept[1] if kept else 0
-        left = self._ahead.left(number)
+        left = self._ahead.changes_after(number)
         history = kept[0] if kept and left.goes_on else self.history
         for _number, change in left.changes:
             self.tables.check(change)

@@ -39,7 +39,7 @@ from appliance.network.firewall.firewall_rules import (
     PortRange,
     appliance_rules,
 )
-from appliance.network.firewall.rule_watch import RuleWatch, subscribed
+from appliance.network.firewall.rule_watch import RuleWatch, subscribe
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.listening_sockets import TcpSocket, listening_ports, tcp_inodes
 from appliance.network.machine_addresses import machine_addresses
@@ -344,7 +344,7 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def watch_rules(self) -> list[RuleWatch]:
-        return [RuleWatch(subscribed(self._namespace))]
+        return [RuleWatch(subscribe(self._namespace))]
 
     def restore(self) -> RestoredRules:
         found = [] if self.firewall is None else self.firewall.restore()
@@ -507,7 +507,7 @@ class NetnsIsolation(ContainerIsolation):
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        with self._namespace.entered():
+        with self._namespace.inside():
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:

@@ -56,7 +56,7 @@ class MonitorMemory:
             own = self._folder / f"{int(lives[-1].name) + 1 if lives else 1:06}"
             own.mkdir(mode=0o700)
             for index in range(relays):
-                self._own.append(_made(own / f"relay-{index}"))
+                self._own.append(_make(own / f"relay-{index}"))
             _sync(self._folder)
         except OSError as error:
             log.warning(
@@ -128,7 +128,7 @@ def _is_written(path: Path) -> bool:
         return any(file.read(_HEAD)[_HEAD - 1 :])
 
 
-def _made(path: Path) -> int:
+def _make(path: Path) -> int:
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(path, flags, 0o600)
     try:

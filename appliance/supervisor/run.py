@@ -77,7 +77,7 @@ async def _build_later(
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stopped.set)
     loop.add_signal_handler(signal.SIGHUP, lambda: None)  # the policy is read when it starts
-    async with manager.watched():
+    async with manager.watch():
         while True:
             try:
                 async with _said(f"waits: {reason}", manager, admin):
@@ -90,7 +90,7 @@ async def _retry(build: Callable[[], T], reason: str, stopped: asyncio.Event) ->
     """Return what `build` returns, or None if `stopped` is set. Raises `PortInUseError` for another reason."""
     began = clock.now()
     while True:
-        with signals.heard(), contextlib.suppress(TimeoutError):
+        with signals.hear(), contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_PORT_LOOK_SECONDS):
                 await stopped.wait()
         for _ in range(3):  # let the loop deliver a signal of the last moment
@@ -132,7 +132,7 @@ class HoldAround:
         self._looked_at = -math.inf
         self._removed = 0
         self._served: str | None = None
-        self._arms = True  # at the last `served`
+        self._arms = True  # at the last `lift_hold`
         if (
             used
             and settings.isolation != "none"
@@ -181,24 +181,24 @@ class HoldAround:
         self, is_open: Callable[[], bool], is_released: Callable[[], bool] = lambda: False
     ) -> str:
         """Keep the hold until other machines reach the appliance, and not the robot's own master, or until that is
-        released; see `served`.
+        released; see `lift_hold`.
         """
         while not is_open():
             self.keep()
             await asyncio.sleep(_KEEP_SECONDS)
-        return self.served(arms=not is_released())
+        return self.lift_hold(arms=not is_released())
 
-    def served(self, *, arms: bool = True) -> str:
+    def lift_hold(self, *, arms: bool = True) -> str:
         """Lift and arm the hold, once; without `arms`, for a robot that was released, disarm it.
 
         Return an alarm if it is not lifted, if another program had removed its rules, or if the robot's own programs
         started without the appliance.
         """
         if self._served is None or arms != self._arms:
-            self._served, self._arms = self._lifted(self._ports if arms else None), arms
+            self._served, self._arms = self._lift(self._ports if arms else None), arms
         return self._served
 
-    def _lifted(self, armed: HeldPorts | None) -> str:
+    def _lift(self, armed: HeldPorts | None) -> str:
         if not self._hold.is_present:
             return ""
         lapsed, trouble = False, ""
@@ -266,7 +266,7 @@ def run_appliance(
     raised = _weigh(pairing) if pairing is not None else 0
     drop_unused_capabilities()
     refuse_half_restored(settings.state)
-    with signals.held():
+    with signals.hold():
         _run(settings, roles, ready, node_ports, pairing=pairing, waits=waits, raised=raised)
 
 
@@ -300,7 +300,7 @@ def _run(
             master=master,
             rosmaster=settings.rosmaster_port,
             nodes=node_ports,
-            unserved=_unserved(settings.listen_address[0]),
+            unserved=_unserved_families(settings.listen_address[0]),
             api=settings.api_address[1] if settings.api_address else None,
             api_networks=tuple(str(network) for network in settings.api_networks),
             receivers=tuple(
@@ -324,7 +324,7 @@ def _run(
         def say_ready(said: ControlReady) -> None:
             ready(said, settings)
             if not isolation.awaits_graph():
-                isolation.lapse = hold.served(arms=not isolation.is_released())
+                isolation.lapse = hold.lift_hold(arms=not isolation.is_released())
             manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
 
         def say_standing_by() -> None:
@@ -416,7 +416,7 @@ def _built(settings: Settings, isolation: NoIsolation) -> dict[str, socket.socke
         raise
 
 
-def _unserved(listen: str) -> tuple[Family, ...]:
+def _unserved_families(listen: str) -> tuple[Family, ...]:
     """Return the families of addresses to which this one does not answer; :: answers to both."""
     return () if listen == "::" else (4,) if family_of(listen) == 6 else (6,)
 
@@ -486,7 +486,7 @@ async def _supervise(
     make: Callable[[], Supervisor], isolation: NoIsolation, hold: HoldAround, manager: ServiceManager
 ) -> None:
     supervisor = make()
-    async with manager.watched():
+    async with manager.watch():
         keeping = asyncio.create_task(_keep(hold, supervisor, isolation))
         try:
             await supervisor.run()

@@ -46,7 +46,7 @@ class ServiceManager:
         self._say("STOPPING=1\nSTATUS=stopping its processes, then removing its firewall")
 
     @asynccontextmanager
-    async def watched(self) -> AsyncIterator[None]:
+    async def watch(self) -> AsyncIterator[None]:
         task = asyncio.create_task(self._live())
         try:
             yield

@@ -12,8 +12,8 @@ _ENDING = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 
 
 @contextmanager
-def held() -> Iterator[None]:
-    """Hold the signals except within `heard`, and then ignore them. Main thread only."""
+def hold() -> Iterator[None]:
+    """Hold the signals except within `hear`, and then ignore them. Main thread only."""
     before = block()
     try:
         yield
@@ -25,7 +25,7 @@ def held() -> Iterator[None]:
 
 
 @contextmanager
-def heard() -> Iterator[None]:
+def hear() -> Iterator[None]:
     before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     try:
         yield

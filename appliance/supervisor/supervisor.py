@@ -180,7 +180,7 @@ class Supervisor:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.stop)
         loop.add_signal_handler(signal.SIGHUP, lambda: self._tell_control(messages.PolicyReloadRequested()))
-        with signals.heard():
+        with signals.hear():
             await self._serve()
         if self.failure is not None:
             raise StartError(self.failure)
@@ -191,7 +191,7 @@ class Supervisor:
         try:
             await self._start()
             self._spawn(self._watchdog.run())
-            self._spawn(keep_priorities(self._prioritized))
+            self._spawn(keep_priorities(self._prioritize))
             await self.stopping.wait()
             await self._announce_end()
         finally:
@@ -665,7 +665,7 @@ class Supervisor:
                 self._clock = read
                 self._tell_control(read)
 
-    def _prioritized(self) -> list[PrioritizedProcess]:
+    def _prioritize(self) -> list[PrioritizedProcess]:
         usual = os.getpriority(os.PRIO_PROCESS, 0) + self._facts.raised
         return [
             PrioritizedProcess(slot.process.pid, usual + slot.role.nice, usual)

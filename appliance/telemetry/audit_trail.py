@@ -92,7 +92,7 @@ class Meter:
         self.denied_requests = LastMinute(most=MAX_REQUESTS)
         self.dropped = LastMinute()
 
-    def recorded(self, record: AuditRecord) -> None:
+    def count_record(self, record: AuditRecord) -> None:
         """Count the decision of a record. `AuditTrail` calls this for every record, so that none is left out."""
         if record.decision is None or (record.decision == "allow" and record.event != "decision"):
             return  # not a decision of the policy, such as a call of REST
@@ -120,7 +120,7 @@ class Meter:
             return f"{host} was denied {asked}{more}, {counted(number, 'time')}"
         return ""
 
-    def called(self, call: str, seconds: float) -> None:
+    def count_call(self, call: str, seconds: float) -> None:
         """Count a call; `call` is a name of the call table, never text from a client."""
         histogram = self.calls.get(call)
         if histogram is None:
@@ -289,7 +289,7 @@ class AuditTrail:
         )
 
     def _record(self, record: AuditRecord) -> str:
-        self.meter.recorded(record)
+        self.meter.count_record(record)
         return self.audit.record(record)
 
     def _completing(self, decision: str | None, severity: Severity) -> Sequence[RecordDetails]:

@@ -117,7 +117,7 @@ class Simulation:
         self._now = START
         self._pose, self._turret, self._wanted = physics.Pose(), physics.Turret(), physics.Turret()
         self._velocity, self._told, self._charge = physics.Velocity(), START, 1.0
-        definitions = standard_definitions().extended(Definitions.from_files(DEFINITIONS))
+        definitions = standard_definitions().merge(Definitions.from_files(DEFINITIONS))
         texts = {file.name: file.read_text(encoding="utf-8") for file in specifications}
         self._monitors = MonitorSet.of(compiled_from(texts, definitions))
         self._monitors.start(START)

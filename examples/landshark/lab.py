@@ -65,7 +65,7 @@ class Host:
 
     def entered(self) -> contextlib.AbstractContextManager[None]:
         """Move the calling thread to the host for a block, which must not await."""
-        return self.namespace.entered()
+        return self.namespace.inside()
 
 
 class Lab:

@@ -18,10 +18,10 @@ from pathlib import Path
 from lab.closed_loop.results import (
     Rows,
     as_data,
-    continued,
-    corrected,
-    joined,
-    parsed,
+    continue_rows,
+    correct_rows,
+    join_runs,
+    parse_rows,
     present_digests,
     rows_of,
 )
@@ -53,14 +53,14 @@ def _write(path: Path, rows: Rows) -> None:
 
 
 def _read(path: Path) -> Rows:
-    return parsed(json.loads(path.read_text(encoding="utf-8")))
+    return parse_rows(json.loads(path.read_text(encoding="utf-8")))
 
 
 def _join(files: list[Path], again: Path | None, to: Path) -> int:
     try:
-        rows, left_out = joined([_read(file) for file in files], present_digests())
+        rows, left_out = join_runs([_read(file) for file in files], present_digests())
         if again:
-            rows = corrected(rows, _read(again))
+            rows = correct_rows(rows, _read(again))
     except ValueError as error:
         sys.stderr.write(f"{error}\n")
         return 1
@@ -129,7 +129,7 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(f"{preset}: {one}\n")
     if to := chosen.rows or chosen.json:
         date = datetime.datetime.now(datetime.UTC).date().isoformat()
-        _write(to, continued(before, rows_of(summaries, firsts, _commit(), date)))
+        _write(to, continue_rows(before, rows_of(summaries, firsts, _commit(), date)))
     return 1 if any(summary.broken for summary in summaries.values()) else 0
 
 

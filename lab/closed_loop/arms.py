@@ -143,7 +143,7 @@ class JointsWorld(World):
         """Whether reports have stamps."""
         self.began = EPOCH + (r.uniform(-900, 900) if self.stamps else 0)
         """The second in which the controller's time begins; that of the guard begins at `EPOCH`."""
-        self.guarded({**values, **bounds, **declared})
+        self.guard_with({**values, **bounds, **declared})
         halves = r.random() < (0.7 if self.alone else 0.4)
         self.reports = {3: JOINTS[:1], 4: JOINTS[1:]} if halves else {3: JOINTS}
         for node, names in self.reports.items():
@@ -323,9 +323,9 @@ class JointsWorld(World):
             ]
             at += seconds
             points.append(Point(at, tuple(place)))
-        return self.bent(points, lambda far, fast: far <= 0.99 * self.most and fast <= 0.99 * self.fastest)
+        return self.bend(points, lambda far, fast: far <= 0.99 * self.most and fast <= 0.99 * self.fastest)
 
-    def bent(self, points: list[Point], fits: Callable[[float, float], bool]) -> list[Point]:
+    def bend(self, points: list[Point], fits: Callable[[float, float], bool]) -> list[Point]:
         """Return the points with velocities such that the curves between them fit, or else as they are."""
         r = self.random
         for _try in range(20 if self.curved else 0):
@@ -347,17 +347,17 @@ class JointsWorld(World):
         if self.switched_off or not passes or not sent.points:
             return
         if self.holding or self.guard.holds:
-            self.broken("L5", "a trajectory passes a guard that holds")
+            self.breach("L5", "a trajectory passes a guard that holds")
         if why := self.beside_source():
-            self.broken("L4", f"a trajectory passes: {why}")
+            self.breach("L4", f"a trajectory passes: {why}")
         law = {"NaN": "L2", "infinite": "L2", "jump": "L3"}.get(sent.bad, "L1")
         if sent.bad:
-            self.broken(law, f"a trajectory passes that is wrong: {sent.bad}")
+            self.breach(law, f"a trajectory passes that is wrong: {sent.bad}")
         may_answer = self.second is not None and not self.third
         for node in self.heard if may_answer else self.reports:
             asked = {*self.reports[node]} & {*sent.names}
             if asked and self.now > max(self.heard.get(node, NEVER) + self.silent * 1000, self.fresh_from):
-                self.broken(
+                self.breach(
                     "L4" if self.foreign else "L2",
                     f"a trajectory passes, and node {node} does not report where the joints are",
                 )
@@ -372,7 +372,7 @@ class JointsWorld(World):
         if sent is None or not sent.points:
             self._stop()
             return
-        update = self.controller.updated(self.time) + self.controller.period
+        update = self.controller.last_update(self.time) + self.controller.period
         if not self.controller.take(self.time, sent.names, sent.stamp, sent.points):
             self.trace("the controller rejects it")
             return
@@ -381,7 +381,7 @@ class JointsWorld(World):
 
     def _stop(self) -> None:
         # It begins at the last update of the controller, or the state before.
-        times = self.time, self.controller.updated(self.time)
+        times = self.time, self.controller.last_update(self.time)
         for joint, begin in enumerate(self.begins):
             begun = begin <= max(times) + _ROUNDING
             if self.unknown or begun:
@@ -426,15 +426,15 @@ class JointsWorld(World):
         self.extra[joint] = max(0.0, self.extra[joint] + moved - OVERSHOOT * self.fastest * passed)
         if not self.extra[joint] <= self.jump + OVERSHOOT * self.fastest * self.controller.period + _NEAR:
             gained = f"{JOINTS[joint]} has gained {self.extra[joint]:.3f} rad on 1.1 vMax"
-            self.broken("L3", f"{gained}, and a jump is {self.jump}")
+            self.breach("L3", f"{gained}, and a jump is {self.jump}")
         if time < self.begins[joint] - _ROUNDING:  # then its first point, if that is at 0 s, is a jump
             self.rest[joint] -= moved
             if not self.rest[joint] >= -_NEAR:
-                self.broken("L3", f"{JOINTS[joint]} moves on after a stop by more than the way of a stop")
+                self.breach("L3", f"{JOINTS[joint]} moves on after a stop by more than the way of a stop")
         elif not abs(place) <= self.most + _NEAR and abs(place) > abs(before):
-            self.broken("L1", f"{JOINTS[joint]} is out of its limits: {place:.3f}")
+            self.breach("L1", f"{JOINTS[joint]} is out of its limits: {place:.3f}")
 
     def ended(self) -> None:
         sent, passed = self.report.honest["sent"], self.report.honest["passed"]
         if passed < 0.9 * sent:
-            self.broken("live", f"of {sent} honest trajectories {passed} pass")
+            self.breach("live", f"of {sent} honest trajectories {passed} pass")

@@ -80,11 +80,11 @@ class Base:
         turning = turning if math.isfinite(turning) else self.turn_top
         return x, y, max(-self.turn_top, min(self.turn_top, turning))
 
-    def _turned(self, now: float, wanted: float, seconds: float) -> float:
+    def _turn(self, now: float, wanted: float, seconds: float) -> float:
         most = self.turn_gathering * seconds
         return now + max(-most, min(most, wanted - now))
 
-    def placed(self, x: float, y: float) -> Point:
+    def to_world(self, x: float, y: float) -> Point:
         """Return a place in the frame of the base in that of the world."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return self.x + x * cos - y * sin, self.y + x * sin + y * cos
@@ -93,15 +93,15 @@ class Base:
     def seen_from(self) -> tuple[float, float, float]:
         """Return where the sensor is, and its direction, in the frame of the world."""
         x, y, turned = self.sensor
-        return (*self.placed(x, y), self.heading + turned)
+        return (*self.to_world(x, y), self.heading + turned)
 
     def _step(self, seconds: float) -> None:
         x, y, turn = self.wanted
         if self.kind == STEERED:
-            self.steered = self._turned(self.steered, turn, seconds)
+            self.steered = self._turn(self.steered, turn, seconds)
             self.turning = self.vx * math.tan(self.steered) / self.wheelbase
         else:
-            self.turning = self._turned(self.turning, turn, seconds)
+            self.turning = self._turn(self.turning, turn, seconds)
         before = self.velocity
         dx, dy = x - self.vx, y - self.vy
         # A base that stands sets out in the direction that it is commanded.

@@ -112,11 +112,11 @@ class Controller:
     def _active(way: Sequence[Segment], time: float) -> int:
         return max(0, bisect.bisect_right(way, time, key=lambda each: each.begin) - 1)
 
-    def updated(self, now: float) -> float:
+    def last_update(self, now: float) -> float:
         return math.floor(now / self.period) * self.period
 
     def stop(self, now: float) -> None:
-        now = self.updated(now)
+        now = self.last_update(now)
         for joint, way in enumerate(self.ways):
             p, v, _a = self.state(joint, now)
             if not self.stopping:
@@ -132,7 +132,7 @@ class Controller:
         if not points:
             self.stop(now)
             return True
-        now = self.updated(now) + self.period
+        now = self.last_update(now) + self.period
         begin = now if stamp is None else stamp
         left = [point for point in points if begin + point.at > now]
         if (

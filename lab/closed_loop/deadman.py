@@ -32,7 +32,7 @@ class DeadmanWorld(World):
         self.kind = r.choice(VELOCITIES)
         self.silent = round(r.uniform(0.1, 1), 2)
         self.resume = r.choice((0.2, 0.2, 0.45))
-        self.guarded({"silent": self.silent, "resume": self.resume})
+        self.guard_with({"silent": self.silent, "resume": self.resume})
         self.live = r.random() < 0.15
         self.sent = self.got = 0
         self.drivers = {node: Driver(node) for node in range(1, 2 if self.live else r.choice((2, 3)))}
@@ -85,9 +85,9 @@ class DeadmanWorld(World):
         if got is not None and self.moves(got):
             driver.got_at = self.now
             if self.now < driver.broke_at + self.resume * 1000 - SLACK:
-                self.broken("L6", f"a motion passes {self.now - driver.broke_at} ms after a silence")
+                self.breach("L6", f"a motion passes {self.now - driver.broke_at} ms after a silence")
             if late > self.silent + SLACK / 1000 and driver.broke_at >= self.now - 10:
-                self.broken("L6", f"a motion passes that comes {late:.2f} s late, after a silence")
+                self.breach("L6", f"a motion passes that comes {late:.2f} s late, after a silence")
             self.got += self.now > 1500
         self.sent += self.now > 1500
 
@@ -106,10 +106,10 @@ class DeadmanWorld(World):
             is_silent = self.now > max(driver.got_at, driver.heard) + limit
             if driver.wants_motion and is_silent and driver.got_at > max(driver.stopped_at, self.fresh_from):
                 law = "L4" if len(self.drivers) > 1 and self.force[0] > driver.heard else "L3"
-                self.broken(
+                self.breach(
                     law, f"node {driver.node} is silent since {driver.heard} ms, and no stop has come"
                 )
 
     def ended(self) -> None:
         if self.live and self.got < 0.9 * self.sent:
-            self.broken("live", f"of {self.sent} commands of a node that is never silent {self.got} pass")
+            self.breach("live", f"of {self.sent} commands of a node that is never silent {self.got} pass")

@@ -44,7 +44,7 @@ class EstopWorld(World):
         self.live = r.random() < 0.15
         self.publishers = self.seed % (2 if self.live else 3)
         self.together, self.zero_first = r.choice((0.3, 0.5, 2.0)), r.random() < 0.8
-        self.guarded({
+        self.guard_with({
             "twoHands": self.hands, "silent": self.silent, "publishers": self.publishers, "together": self.together,
             "zeroFirst": self.zero_first, "forget": r.choice((0, 7)),
         })  # fmt: skip
@@ -92,7 +92,7 @@ class EstopWorld(World):
                 self._latch()
         self.say("stop", boolean(on), node)
         if on and not self.switched_off and self.moves(self.force[1]):
-            self.broken("L3", "a press does not stop the base at once")
+            self.breach("L3", "a press does not stop the base at once")
 
     def _latch(self) -> None:
         """Note a stop that only a reset ends."""
@@ -203,28 +203,28 @@ class EstopWorld(World):
 
     def _may_move(self, node: int) -> None:
         if self.doubtful:
-            self.broken(self.doubtful, "a motion passes before a person has resumed the guard")
+            self.breach(self.doubtful, "a motion passes before a person has resumed the guard")
         pressed = [one for one, button in self.stops.items() if button.on]
         if pressed:
-            self.broken(
+            self.breach(
                 "L4" if len(self.stops) > 1 else "L3",
                 f"a motion passes while node {pressed[0]} presses the stop",
             )
         if self.needs_reset:
-            self.broken(
+            self.breach(
                 self.latched_by, f"a motion passes without a reset after the stop at {self.latched_at} ms"
             )
         if node in self.waiting and self.zero_first:
-            self.broken(
+            self.breach(
                 "L6",
                 f"node {node} has not stood still since the reset at {self.reset_at} ms, or a resume",
             )
         heard = sum(button.heard != NEVER for button in self.stops.values())
         if heard < max(self.publishers, 1):
-            self.broken("L2", f"a motion passes when {heard} of {self.publishers} buttons have spoken")
+            self.breach("L2", f"a motion passes when {heard} of {self.publishers} buttons have spoken")
         for one, button in self.stops.items():
             if self.silent and self.now > button.heard + self.silent * 1000 + 100 + SLACK:
-                self.broken(
+                self.breach(
                     "L4", f"a motion passes while the button of node {one} is silent since {button.heard} ms"
                 )
 
@@ -234,8 +234,8 @@ class EstopWorld(World):
             return
         for one, button in self.stops.items():
             if self.silent and self.now > button.heard + self.silent * 1000 + 100 + SLACK:
-                self.broken("L4", f"a motion stays in force while the button of node {one} is silent")
+                self.breach("L4", f"a motion stays in force while the button of node {one} is silent")
 
     def ended(self) -> None:
         if self.live and not self.moves(self.force[1]):
-            self.broken("live", "after a release, a reset and a stop command a motion does not pass")
+            self.breach("live", "after a release, a reset and a stop command a motion does not pass")

@@ -50,7 +50,7 @@ class EvidenceWorld(World):
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if got is not None and self.moves(got):
             if why := self.fit():
-                self.broken(self.law(), f"a motion passes: {why}")
+                self.breach(self.law(), f"a motion passes: {why}")
             self.unfit_from = NEVER  # it was fit between two looks
         if self.fit_since != NEVER and self.now > self.fit_since and self.moves(wanted):
             self.sent += 1
@@ -66,13 +66,13 @@ class EvidenceWorld(World):
         if self.switched_off or not why or self.now <= self.unfit_from + self.tick + SLACK:
             return
         if self.fresh_from < self.force[0] < self.now and self.moves(self.force[1]):
-            self.broken(self.law(), f"a motion stays in force: {why}")
+            self.breach(self.law(), f"a motion stays in force: {why}")
 
     unfit_from = NEVER
 
     def ended(self) -> None:
         if self.got < 0.95 * self.sent:
-            self.broken("live", f"of {self.sent} commands with all evidence {self.got} pass")
+            self.breach("live", f"of {self.sent} commands with all evidence {self.got} pass")
 
 
 SENSOR_VALUES = {SCAN: 20, RANGE: 1, ODOMETRY: 7, FIX: 3, IMU: 6}
@@ -90,7 +90,7 @@ class SensorWorld(EvidenceWorld):
         self.silent, self.frozen = round(r.uniform(0.1, 1), 2), r.choice((0, 2, 5, 20))
         self.least = r.choice((0.1, 0.5, 1.0))
         self.commands(r.choice((30, 100, 250)))
-        self.guarded({"silent": self.silent, "frozen": self.frozen, "least": self.least}, {"by": self.by})
+        self.guard_with({"silent": self.silent, "frozen": self.frozen, "least": self.least}, {"by": self.by})
         self.heard, self.repeated, self.seeing, self.fault = NEVER, 0, False, ""
         self.known: list[float] = []
         self.shown: list[float] = []
@@ -188,7 +188,7 @@ class ArmWorld(EvidenceWorld):
         )
         self.hundred, self.most = r.random() < 0.3, r.choice((1, 1.3))
         self.commands(r.choice((30, 100, 250)))
-        self.guarded({
+        self.guard_with({
             "charge": self.charge, "hundred": self.hundred, "needFix": self.needs_fix, "needCheck": self.needs_check,
             "silent": self.silent, "checked": self.checked, "most": self.most,
         })  # fmt: skip
@@ -291,7 +291,7 @@ class AgreeWorld(EvidenceWorld):
         self.samples = r.choice((1, 3, 5))
         self.silent = round(r.uniform(0.2, 1), 2)
         self.commands(r.choice((30, 100, 250)))
-        self.guarded(
+        self.guard_with(
             {
                 "tolerance": self.tolerance,
                 "turning": self.turning,

@@ -72,12 +72,12 @@ class RunningGuard:
         self, topic: str, data: bytes, at: int, node: int
     ) -> tuple[bytes | None, list[tuple[int, str, bytes]]]:
         """Return the message as it goes on, or None if it was dropped, and the messages that the guard sends."""
-        outcome = self._judged(topic, bytearray(data), _ns(at), MessageSender(node))
+        outcome = self._judge(topic, bytearray(data), _ns(at), MessageSender(node))
         sent = [one for before in outcome.before for one in self._sent(before)]
         passed = None if outcome.result == "dropped" else bytes(outcome.buffer)
         return passed, [*sent, *self._sent(outcome)]
 
-    def _judged(self, topic: str, data: bytearray, now: int, sender: MessageSender) -> Outcome:
+    def _judge(self, topic: str, data: bytearray, now: int, sender: MessageSender) -> Outcome:
         """Process a message as a relay does once it has reported the first changes: also changes stay in the module."""
         found = self._monitors.process_fast(topic, data, now, lambda lane: self._options(lane, sender.source))
         return self._monitors.process(topic, data, now, sender) if found is None else found
@@ -88,7 +88,7 @@ class RunningGuard:
 
     @staticmethod
     def _sent(outcome: Outcome) -> Iterator[tuple[int, str, bytes]]:
-        for one in outcome.sent():
+        for one in outcome.sent_messages():
             if not one.is_call:
                 yield (outcome.time - _ns(0)) // MS, one.topic, bytes(one.data)
 

@@ -3,7 +3,7 @@
 import math
 from typing import ClassVar
 
-from lab.closed_loop.messages import STILL, VELOCITIES, Legs, fields_of, steered, straight
+from lab.closed_loop.messages import STILL, VELOCITIES, Legs, encode_steering, fields_of, straight
 from lab.closed_loop.world import NEVER, World
 
 
@@ -19,7 +19,7 @@ class SpeedWorld(World):
         self.most, self.turn = round(r.uniform(0.1, 3), 2), round(r.uniform(0.1, 3), 2)
         self.growth, self.turn_growth = round(r.uniform(0.2, 20), 2), round(r.uniform(0.2, 20), 2)
         self.angle, self.rate, self.jerk = (round(r.uniform(0.1, most), 2) for most in (1.5, 3, 30))
-        self.guarded({
+        self.guard_with({
             "vMax": self.most, "wMax": self.turn, "aMax": self.growth, "alphaMax": self.turn_growth,
             "steerMax": self.angle, "steerSpeed": self.rate, "jerkMax": self.jerk,
         })  # fmt: skip
@@ -40,7 +40,7 @@ class SpeedWorld(World):
                 self.drive(legs)
                 return
             more = [r.choice((0.0, 0.5, -9.0, 99.0, 1e30, math.inf, math.nan)) for _field in range(3)]
-            self.publish(steered(self.kind, self.now, [legs[5], legs[0], *more]))
+            self.publish(encode_steering(self.kind, self.now, [legs[5], legs[0], *more]))
 
         self.every(
             lambda: period * r.uniform(0.9, 1.1) if self.live or r.random() > 0.02 else r.uniform(900, 1500),
@@ -54,9 +54,9 @@ class SpeedWorld(World):
         steers = self.kind.startswith("ackermann")
         speed, turn = math.hypot(*got[:3]), 0.0 if steers else math.hypot(*got[3:])
         if not (math.isfinite(speed) and math.isfinite(got[5]) and math.isfinite(turn)):
-            self.broken("L2", "a velocity that is not a number passes a limit of velocities")
+            self.breach("L2", "a velocity that is not a number passes a limit of velocities")
         if speed > self.most * (1 + 1e-6) or turn > self.turn * (1 + 1e-6):
-            self.broken(
+            self.breach(
                 "L1", f"{speed:.3f} m/s and {turn:.3f} rad/s pass; {self.most} and {self.turn} are permitted"
             )
         at, before, turned = self.before
@@ -67,7 +67,7 @@ class SpeedWorld(World):
             or turn > (turned + self.turn_growth * seconds) * rounded
         ):
             law = "L6" if self.fresh_from > at else "L1"
-            self.broken(
+            self.breach(
                 law,
                 f"{before:.3f} m/s grow to {speed:.3f}, {turned:.3f} rad/s to {turn:.3f} in {seconds:.2f} s",
             )
@@ -83,7 +83,7 @@ class SpeedWorld(World):
         at, before = self.steering
         most = self.rate * max(0.1, (self.now - at) / 1000) * (1 + 1e-6) + 1e-6
         if not (abs(angle) <= self.angle * (1 + 1e-6) and abs(angle - before[5]) <= most):
-            self.broken("L1", f"the steering angle of {before[5]:.3f} rad becomes {angle:.3f}")
+            self.breach("L1", f"the steering angle of {before[5]:.3f} rad becomes {angle:.3f}")
         brakes = abs(speed) < abs(before[0]) and speed * before[0] >= 0
         for name, value, limit in (
             ("steering rate", rate, self.rate),
@@ -91,7 +91,7 @@ class SpeedWorld(World):
             ("jerk", jerk, math.inf if brakes else self.jerk),
         ):
             if not abs(value) <= limit * (1 + 1e-6):
-                self.broken("L1", f"a {name} of {value:.3f} passes; {limit} is permitted")
+                self.breach("L1", f"a {name} of {value:.3f} passes; {limit} is permitted")
 
     def received(self, at: int, legs: Legs) -> None:
         super().received(at, legs)
@@ -106,7 +106,7 @@ class SpeedWorld(World):
             self.most / self.growth * 1.5
         )  # commands that come less often than every 0.2 s grow more slowly
         if self.live and needed < 2 and abs(self.force[1][0] - 0.9 * self.most) > 1e-5:
-            self.broken(
+            self.breach(
                 "live", f"a permitted {0.9 * self.most:.2f} m/s is {self.force[1][0]:.2f} m/s in the end"
             )
 
@@ -120,7 +120,7 @@ class SaneWorld(World):
     def plan(self) -> None:
         r = self.random
         self.kind = r.choice(VELOCITIES)
-        self.guarded({})
+        self.guard_with({})
         self.interrupt()
         self.whole = True
         self.every(lambda: r.choice((20, 100, 300)), self._send, first=50)
@@ -132,18 +132,18 @@ class SaneWorld(World):
         if self.kind.startswith("ackermann"):
             parts = [bad if place == wrong else r.uniform(-1, 1) for place in range(5)]
             self.whole = wrong >= 5
-            self.publish(steered(self.kind, self.now, parts))
+            self.publish(encode_steering(self.kind, self.now, parts))
             return
         self.whole = wrong >= 6
         self.drive(tuple(bad if place == wrong else r.uniform(-1, 1) for place in range(6)))  # type: ignore[arg-type]  # six
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if not self.whole and got is not None and self.moves(got):
-            self.broken(
+            self.breach(
                 "L1" if self.kind.startswith("ackermann") else "L2", "a command passes that is not finite"
             )
         if self.whole and got != wanted and not self.guard.holds:
-            self.broken("live", "a finite command does not pass")
+            self.breach("live", "a finite command does not pass")
 
     def watch(self) -> None:
         self.only_fresh()
@@ -159,7 +159,7 @@ class RateWorld(World):
         r = self.random
         self.kind = r.choice(VELOCITIES)
         self.interval, self.burst = round(r.uniform(0.02, 0.3), 3), r.choice((1, 2, 5))
-        self.guarded({"interval": self.interval, "burst": self.burst})
+        self.guard_with({"interval": self.interval, "burst": self.burst})
         self.interrupt()
         self.motions: list[int] = []
         self.last: Legs = STILL
@@ -172,7 +172,7 @@ class RateWorld(World):
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if got is None and not self.moves(wanted) and not self.guard.holds:
-            self.broken("L3", "a stop is dropped")
+            self.breach("L3", "a stop is dropped")
         slower = self._slower(wanted, self.before)
         if got is not None and self.moves(got) and not slower:
             # After a hold, a restart or an `enable`, a burst may come again.
@@ -180,11 +180,11 @@ class RateWorld(World):
             for count in range(self.burst + 1, min(30, len(self.motions)) + 1):
                 seconds = (self.motions[-1] - self.motions[-count]) / 1000
                 if count > self.burst + 1 + seconds / self.interval + 1e-6:
-                    self.broken(
+                    self.breach(
                         "L3", f"{count} motions, none slower than the one before, pass in {seconds:.3f} s"
                     )
         if got is None and slower and not self.guard.holds:
-            self.broken("L3", f"{wanted[0]} m/s is dropped while {self.before[0]} m/s is in force")
+            self.breach("L3", f"{wanted[0]} m/s is dropped while {self.before[0]} m/s is in force")
 
     def _slower(self, one: Legs, other: Legs) -> bool:
         turns = (0.0, 0.0) if self.kind.startswith("ackermann") else (abs(one[5]), abs(other[5]))

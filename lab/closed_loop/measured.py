@@ -99,7 +99,7 @@ class MeasuredWorld(World):
 
     def forgets(self) -> None:
         self.measure = (NEVER, math.nan, math.nan)
-        self.noted()
+        self.note_measurement()
 
     def _sense(self) -> None:
         if self.fault == "dead":
@@ -117,20 +117,20 @@ class MeasuredWorld(World):
         data = odometry(self.now, (0, 0, 0, 0, 0, 0, 1), velocity)
         if self.fault == "cut":
             self.measure = (NEVER, math.nan, math.nan)
-            self.noted()
+            self.note_measurement()
             self.say("by", data[:20], whole=False)
             return
         self.measure = (self.now, math.hypot(*velocity[:3]), abs(velocity[5]))
         bad = self.fault in {"NaN", "infinite"}
         self.bad_from = (self.now if self.bad_from == NEVER else self.bad_from) if bad else NEVER
-        self.noted()
+        self.note_measurement()
         self.say("by", data)
-        self.sensed()
+        self.check_act()
 
-    def noted(self) -> None:
+    def note_measurement(self) -> None:
         """Note a measurement, before the guard gets it."""
 
-    def sensed(self) -> None:
+    def check_act(self) -> None:
         """Check the act of the guard at a measurement."""
 
     def received(self, at: int, legs: Legs) -> None:
@@ -163,7 +163,7 @@ class MeasuredWorld(World):
 
     def ended(self) -> None:
         if self.live and self.passing < 0.95 * self.sent:
-            self.broken("live", f"of {self.sent} commands of a base that obeys {self.passing} pass")
+            self.breach("live", f"of {self.sent} commands of a base that obeys {self.passing} pass")
 
     def count(self, wanted: Legs, got: Legs | None) -> None:
         if self.live and self.now > 1500:
@@ -179,7 +179,7 @@ class OverspeedWorld(MeasuredWorld):
     def plan(self) -> None:
         self.begun(1.0)
         self.most, self.turn = round(self.random.uniform(0.45, 1), 2), round(self.random.uniform(0.5, 2), 2)
-        self.guarded(
+        self.guard_with(
             {"vMax": self.most, "wMax": self.turn, "still": self.still, "silent": self.silent},
             {"by": ODOMETRY},
         )
@@ -189,19 +189,19 @@ class OverspeedWorld(MeasuredWorld):
         _at, speed, turn = self.measure
         return not (speed <= self.most and turn <= self.turn)
 
-    def noted(self) -> None:
+    def note_measurement(self) -> None:
         self.waits = self.waits or self._fast()
 
-    def sensed(self) -> None:
+    def check_act(self) -> None:
         if self._fast() and not self.foreign and not self.switched_off and self.moves(self.force[1]):
-            self.broken("L3", "a measurement is too fast, and does not stop the base at once")
+            self.breach("L3", "a measurement is too fast, and does not stop the base at once")
 
     def passed(self, node: int, wanted: Legs, got: Legs | None) -> None:
         if got is not None and self.moves(got):
             if self.waits:
-                self.broken("L6", "a motion passes of a base that has not stood since it was too fast")
+                self.breach("L6", "a motion passes of a base that has not stood since it was too fast")
             if (why := self.unknown(SLACK)) and self.now > self.fresh_from:
-                self.broken(self.law(), f"a motion passes, and {why}")
+                self.breach(self.law(), f"a motion passes, and {why}")
         if self.unknown():
             self.waits = True
         if not self.moves(wanted) and self.stands and not self.unknown() and not self.guard.holds:
@@ -217,7 +217,7 @@ class OverspeedWorld(MeasuredWorld):
             and self.moves(self.force[1])
             and self.now > self.fresh_from + 100 + SLACK
         ):
-            self.broken(self.law(), f"a motion stays in force, and {why}")
+            self.breach(self.law(), f"a motion stays in force, and {why}")
 
 
 class StandstillWorld(MeasuredWorld):
@@ -228,7 +228,7 @@ class StandstillWorld(MeasuredWorld):
     def plan(self) -> None:
         self.begun(0.5)
         self.settle = round(self.random.uniform(0.7, 1.5), 2)
-        self.guarded({"settle": self.settle, "still": self.still, "silent": self.silent}, {"by": ODOMETRY})
+        self.guard_with({"settle": self.settle, "still": self.still, "silent": self.silent}, {"by": ODOMETRY})
         self.stopped_at = 0
         """The time of the command to stand; `NEVER` while the base is commanded to move."""
         self.stop_at = 0
@@ -246,7 +246,7 @@ class StandstillWorld(MeasuredWorld):
             self.stop_at = at
             self.stopped_at = at if self.stopped_at == NEVER else self.stopped_at
 
-    def noted(self) -> None:
+    def note_measurement(self) -> None:
         read, self.read = self.read, self.measure[0] != NEVER
         if self.read and not read and self.stopped_at != NEVER:
             self.stopped_at = self.now  # after unreadable bytes the guard begins again
@@ -260,9 +260,9 @@ class StandstillWorld(MeasuredWorld):
     def passed(self, node: int, wanted: Legs, got: Legs | None) -> None:
         if got is not None and self.moves(got):
             if self.waits:
-                self.broken("L6", "a motion passes of a base that has not stood since it escaped")
+                self.breach("L6", "a motion passes of a base that has not stood since it escaped")
             if (why := self.unknown(SLACK)) and self.now > self.fresh_from:
-                self.broken(self.law(), f"a motion passes, and {why}")
+                self.breach(self.law(), f"a motion passes, and {why}")
         if self.unknown() and not self.guard.holds:  # a guard that holds does not see the command
             self.waits = True
         if not self.moves(wanted) and self.stands and not self.unknown() and not self.guard.holds:
@@ -280,13 +280,13 @@ class StandstillWorld(MeasuredWorld):
         off = self.switched_off or self.guard.holds or self.now <= self.fresh_from + 100 + SLACK
         why = self.unknown(TICK + SLACK)
         if why and not off and self.moves(self.force[1]):
-            self.broken(self.law(), f"a motion stays in force, and {why}")
+            self.breach(self.law(), f"a motion stays in force, and {why}")
         if self._escaped(TICK + SLACK) and not self.switched_off:
             self.waits = True
         if NEVER in {self.moving_from, self.stopped_at} or off or why:
             return
         due = max(self.moving_from, self.stopped_at + self.settle * 1000) + 150
         if self.now > due and self.now > self.stop_at + 150:
-            self.broken(
+            self.breach(
                 "L3", f"the base moves since {self.moving_from} ms, and is not stopped again and again"
             )

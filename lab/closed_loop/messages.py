@@ -41,7 +41,7 @@ def steering(angle: float, speed: float, acceleration: float = 0, jerk: float = 
     return _FIVE.pack(*(math.copysign(math.inf, one) if abs(one) > _LARGEST else one for one in numbers))
 
 
-def steered(kind: str, at: float, fields: Sequence[float]) -> bytes:
+def encode_steering(kind: str, at: float, fields: Sequence[float]) -> bytes:
     """Return a command of an Ackermann type: steering angle, speed, acceleration, jerk, and rate of the angle."""
     return (header(at) if kind == ACKERMANN_STAMPED else b"") + steering(*fields)
 

@@ -54,7 +54,7 @@ class DrivenWorld(World):
     each_counts = False
     """Whether persons also count who stepped in from beside, so near that no moving base can stop."""
 
-    def built(
+    def build(
         self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float, *, tight: bool = False
     ) -> None:
         r = self.random
@@ -68,7 +68,7 @@ class DrivenWorld(World):
         self.base.wheelbase = r.choice((0.25, 0.4, 1.0))
         self.base.turn_gathering = r.choice((math.inf, 2.0, 0.7) if kind == STEERED else (math.inf, 6.0, 2.0))
 
-    def driven(self, towards: "tuple[Point, ...]", *, turns: bool = True, forward: bool = False) -> None:
+    def drive_to(self, towards: "tuple[Point, ...]", *, turns: bool = True, forward: bool = False) -> None:
         """Let a node drive towards places, or anywhere, at 1 to 50 Hz, with pauses of up to 2 s."""
         r = self.random
         period = r.choice((20, 50, 100, 200, 500, 1000))
@@ -160,7 +160,7 @@ class DrivenWorld(World):
             return True
         return False
 
-    def measured(self, *, valid: "bool | None") -> None:
+    def note_arrival(self, *, valid: "bool | None") -> None:
         """Note the arrival of a measurement: valid, valid in parts (None), or without any evidence."""
         if valid or valid is None:
             self.heard, self.blind_from = self.now, None
@@ -172,14 +172,14 @@ class DrivenWorld(World):
         if not travels(self.force[1]) or self.switched_off or self.now <= self.fresh_from + 100 + SLACK:
             return
         if self.heard < 0:
-            self.broken(self.law(), "a motion is in force before the first measurement")
+            self.breach(self.law(), "a motion is in force before the first measurement")
         if self.blind_from is not None and self.now > self.blind_from + self.tick + SLACK:
-            self.broken(
+            self.breach(
                 self.law(),
                 f"a motion is in force, though all measurements since {self.blind_from} ms are invalid",
             )
         if self.now > self.heard + silent * 1000 + self.tick + SLACK:
-            self.broken(
+            self.breach(
                 self.law(), f"a motion is in force, though the last measurement came at {self.heard} ms"
             )
 
@@ -235,23 +235,23 @@ class SeparationWorld(DrivenWorld):
         braking, reaction = round(r.uniform(0.4, 3), 2), round(r.uniform(0.1, 0.5), 2)
         margin, self.silent = round(r.uniform(0.3, 0.6), 2), round(r.uniform(0.15, 0.8), 2)
         lag = r.randrange(10, int(reaction * 1000) - 20)
-        self.built(
+        self.build(
             (DIFFERENTIAL,) if self.sector == HALF else (DIFFERENTIAL, OMNIDIRECTIONAL, OMNIDIRECTIONAL, STEERED),
             lag, braking, r.choice((0.5, 1.0, 2.0, 3.0)),
         )  # fmt: skip
         self.reaction, self.braking, self.margin = reaction, braking, margin
         self.radius = margin - r.uniform(0.06, 0.15)
         mounted = round(r.uniform(-math.pi, math.pi) if self.sector == WHOLE else r.uniform(-0.4, 0.4), 2)
-        self.shaped(mounted)
+        self.shape(mounted)
         self._surroundings()
-        self.guarded({
+        self.guard_with({
             "sector": self.sector, "reaction": reaction, "braking": braking, "person": self.speed, "margin": margin,
             "silent": self.silent, "width": round(self.radius + r.uniform(0.06, 0.2), 2),
             "wheelbase": self.base.wheelbase, "mounted": mounted, "unseen": self.unseen,
             "blankIsFree": self.blank is not None,
         }, {"by": SCAN})  # fmt: skip
         self.scanner(r.uniform(25, self.silent * 850), r.uniform(0, reaction * 1000 - lag))
-        self.driven(
+        self.drive_to(
             tuple((person.x, person.y) for person in self.persons) + tuple((w[0], w[1]) for w in self.walls),
             turns=self.sector == WHOLE,
         )  # fmt: skip
@@ -260,7 +260,7 @@ class SeparationWorld(DrivenWorld):
         self.with_second()
         self.interrupt()
 
-    def shaped(self, mounted: float) -> None:
+    def shape(self, mounted: float) -> None:
         """Give the base an outline in some worlds, and the sensor a place and a direction on it.
 
         `radius` is the distance of the farthest corner from the sensor.
@@ -278,13 +278,13 @@ class SeparationWorld(DrivenWorld):
         corners = ((low, right), (high, right), (high, left), (low, left))
         self.base.outline = tuple((px - x, py - y) for px, py in corners)
 
-    def left(self, segment: Segment, radius: float = 0.0) -> float:
+    def gap(self, segment: Segment, radius: float = 0.0) -> float:
         """Return the metres between the base and a wall, or a disc; at most, if it is far from the base."""
         x, y, _turned = self.base.seen_from
         away = math.dist((x, y), geometry.nearest_on(segment, x, y)) - self.radius - radius
         if away > 0.02 or not self.base.outline:
             return away
-        corners = [self.base.placed(*corner) for corner in self.base.outline]
+        corners = [self.base.to_world(*corner) for corner in self.base.outline]
         if geometry.is_inside(corners, *segment[:2]):
             return -radius
         return min(geometry.apart(edge, segment) for edge in geometry.edges(corners)) - radius
@@ -317,7 +317,7 @@ class SeparationWorld(DrivenWorld):
         r = self.random
         self.sector, self.silent, self.radius, self.speed = WHOLE, 0.5, 0.2, r.choice((0.0, 1.6))
         self.unseen, self.blank = 0.0, None
-        self.built((DIFFERENTIAL,), 100, 1.0, 1.0)
+        self.build((DIFFERENTIAL,), 100, 1.0, 1.0)
         self.base.heading = 0.0
         corridor = r.random() < 0.5
         if corridor:
@@ -326,7 +326,7 @@ class SeparationWorld(DrivenWorld):
             self.walls = geometry.edges([(-3, -4), (8, -4), (8, 4), (-3, 4)])
         self.honest = (0.3, 1.8) if corridor else (0.5, 3.0)
         self.span = 8000 if corridor else 9000
-        self.guarded({"sector": self.sector, "person": self.speed, "silent": self.silent}, {"by": SCAN})
+        self.guard_with({"sector": self.sector, "person": self.speed, "silent": self.silent}, {"by": SCAN})
         self.scanner(100, 20)
         self.every(
             lambda: 100, lambda: void(self.drive((self.honest[0], 0.0, 0.0, 0.0, 0.0, 0.0))), first=300
@@ -344,7 +344,7 @@ class SeparationWorld(DrivenWorld):
         self.reaction, self.braking = round(r.uniform(0.2, 0.4), 2), round(r.uniform(0.6, 1.2), 2)
         self.margin, self.silent, top = round(r.uniform(0.3, 0.5), 2), 0.9, r.uniform(0.8, 1.1)
         self.radius, delay = self.margin - 0.01, r.uniform(20, 80)
-        self.built((DIFFERENTIAL,), int(self.reaction * 1000 - delay), self.braking, top, tight=True)
+        self.build((DIFFERENTIAL,), int(self.reaction * 1000 - delay), self.braking, top, tight=True)
         turning = r.choice((-1, 1)) * r.uniform(0.7, 0.9) if self.case == "turn" else 0.0
         match self.case:
             case "person" | "slowing":
@@ -355,7 +355,7 @@ class SeparationWorld(DrivenWorld):
                 self.walls = [(x - 0.1, y, x + 0.1, y)]
             case _:
                 self.walls = [(5.0, self.radius - 0.03, 5.0, 5.0)]
-        self.guarded({
+        self.guard_with({
             "reaction": self.reaction, "braking": self.braking, "person": self.speed, "margin": self.margin,
             "silent": self.silent, "width": round(self.radius + 0.01, 2),
         }, {"by": SCAN})  # fmt: skip
@@ -373,11 +373,11 @@ class SeparationWorld(DrivenWorld):
         speed = math.hypot(*self.base.velocity)
         delay = self.reaction + 0.02
         stops = speed * delay + speed**2 / (2 * self.braking) + self.speed * (delay + speed / self.braking)
-        return self.left((*[self.persons[0].x, self.persons[0].y] * 2,), PERSON_RADIUS) - stops - 0.01  # type: ignore[arg-type]
+        return self.gap((*[self.persons[0].x, self.persons[0].y] * 2,), PERSON_RADIUS) - stops - 0.01  # type: ignore[arg-type]
 
     def receive(self, at: int, topic: str, data: bytes) -> None:
         if self.case == "slowing" and travels(self.force[1]):
-            self.broken("live", "a base that is slowed is stopped between two scans")
+            self.breach("live", "a base that is slowed is stopped between two scans")
         super().receive(at, topic, data)
 
     def scanner(self, period: float, delay: float, exact: "Callable[[], float] | None" = None) -> None:
@@ -423,7 +423,7 @@ class SeparationWorld(DrivenWorld):
 
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         self.say("by", data, 5, whole=whole)
-        self.measured(valid=valid)
+        self.note_arrival(valid=valid)
 
     def _fail(self) -> None:
         faults = SCAN_FAULTS if self.blank is None else set(SCAN_FAULTS) - BLANK_FAULTS
@@ -478,7 +478,7 @@ class SeparationWorld(DrivenWorld):
             if until > one.leaves and away > 0:
                 one.x -= (self.base.x - one.x) / away * one.speed * seconds
                 one.y -= (self.base.y - one.y) / away * one.speed * seconds
-            elif until > one.begins and (left := self.left((one.x, one.y, one.x, one.y), PERSON_RADIUS)) > 0:
+            elif until > one.begins and (left := self.gap((one.x, one.y, one.x, one.y), PERSON_RADIUS)) > 0:
                 way = min(one.speed * seconds, left)
                 one.x += (self.base.x - one.x) / away * way
                 one.y += (self.base.y - one.y) / away * way
@@ -512,12 +512,12 @@ class SeparationWorld(DrivenWorld):
             towards = (vx * dx + vy * dy) / away if away > 0 else math.hypot(vx, vy)
             if towards <= 0.01:
                 continue
-            left = self.left(thing, radius)
+            left = self.gap(thing, radius)
             self.report.clearance = min(self.report.clearance, left)
             if left <= 1e-9:
                 what = "a person" if radius else "a wall"
                 law = self.law("L1" if self.base.kind == OMNIDIRECTIONAL and self.force[1][1] else "L3")
-                self.broken(law, f"the base touches {what} at {towards:.2f} m/s")
+                self.breach(law, f"the base touches {what} at {towards:.2f} m/s")
 
     def _follow(self, person: Person) -> None:
         """Note whether a person has stepped into the base's way from beside it, so near that no moving base can stop.
@@ -543,7 +543,7 @@ class SeparationWorld(DrivenWorld):
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if self.sector == HALF and got is not None and got[0] < -self.unseen * (1 + 1e-6):
-            self.broken("L2", f"{got[0]:.3f} m/s pass out of the sector; {self.unseen} is permitted")
+            self.breach("L2", f"{got[0]:.3f} m/s pass out of the sector; {self.unseen} is permitted")
 
     def _looked(self) -> int:
         """Return when the scanner looked last before the motion passed that the base executes."""
@@ -567,7 +567,7 @@ class SeparationWorld(DrivenWorld):
 
     def ended(self) -> None:
         if self.live and self.base.driven < 0.6 * self.honest[1]:
-            self.broken(
+            self.breach(
                 "live", f"the base drives {self.base.driven:.2f} m, not {self.honest[1]} m, in {self.span} ms"
             )
 
@@ -607,7 +607,7 @@ class FenceWorld(DrivenWorld):
         braking = r.uniform(0.5, 4)
         self.by = r.choice((ODOMETRY, ODOMETRY, POSE, POSE_WITH_COVARIANCE, FIX))
         self.world_frame = self.by == FIX
-        self.built((DIFFERENTIAL, STEERED) if self.live and not self.world_frame else (OMNIDIRECTIONAL,)
+        self.build((DIFFERENTIAL, STEERED) if self.live and not self.world_frame else (OMNIDIRECTIONAL,)
                    if self.world_frame else (DIFFERENTIAL, OMNIDIRECTIONAL, STEERED), lag, braking,
                    (ahead * 0.98 - (lag + delay) / 1000) * braking)  # fmt: skip
         self.noise = 0.0 if self.live else self.margin * r.choice((0, 0, 0.4))
@@ -622,7 +622,7 @@ class FenceWorld(DrivenWorld):
             "worldFrame": self.world_frame, "wheelbase": self.base.wheelbase, "lat0": self.origin[0],
             "lon0": self.origin[1],
         }  # fmt: skip
-        self.guarded(values, {"by": self.by})
+        self.guard_with(values, {"by": self.by})
         self._positions(r.uniform(20, self.silent * (200 if self.live else 900)), delay)
         if self.live:
             self.base.heading = 0.0
@@ -630,7 +630,7 @@ class FenceWorld(DrivenWorld):
             self.honest = min(1.2, speed * 4)
             self.every(lambda: 100, lambda: void(self.drive((speed, 0.0, 0.0, 0.0, 0.0, 0.0))), first=700)
             return
-        self.driven(self.field, turns=not self.outside)
+        self.drive_to(self.field, turns=not self.outside)
         if r.random() < 0.4:
             self.after(r.uniform(300, 6000), self._fail)
         self.with_second()
@@ -649,10 +649,10 @@ class FenceWorld(DrivenWorld):
         self.margin, self.silent, self.ahead = 0.01, 0.9, round(r.uniform(0.5, 0.9), 2)
         delay, lag, braking = r.uniform(20, 60), r.randrange(50, 150), r.uniform(1.5, 3)
         top = (self.ahead - (delay + lag) / 1000) * 2 * braking
-        self.built((DIFFERENTIAL,), lag, braking, min(top, 2.0), tight=True)
+        self.build((DIFFERENTIAL,), lag, braking, min(top, 2.0), tight=True)
         self.base.braking = self.base.full_braking = self.base.top / 2 / (self.ahead - (delay + lag) / 1000)
         corners = " ".join(f"{x},{y}" for x, y in self.field)
-        self.guarded(
+        self.guard_with(
             {"margin": self.margin, "ahead": self.ahead, "silent": self.silent, "polygon": corners},
             {"by": ODOMETRY},
         )
@@ -664,7 +664,7 @@ class FenceWorld(DrivenWorld):
 
     def receive(self, at: int, topic: str, data: bytes) -> None:
         if self.case == "slowing" and travels(self.force[1]) and self.now > self.judged_at:
-            self.broken("live", "a base that is slowed is stopped between two positions")
+            self.breach("live", "a base that is slowed is stopped between two positions")
         super().receive(at, topic, data)
 
     def good(self, topic: str) -> bytes:
@@ -722,7 +722,7 @@ class FenceWorld(DrivenWorld):
     def arrive(self, data: bytes, valid: "bool | None", *, whole: bool) -> None:
         self.judged_at = self.now
         self.say("by", data, 5, whole=whole)
-        self.measured(valid=valid)
+        self.note_arrival(valid=valid)
         if self.case == "slowing" and self.now > 500:
             self.drive(self.legs)
 
@@ -739,7 +739,7 @@ class FenceWorld(DrivenWorld):
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         far = self.planned_act != "switch" and self._depth() < -self.noise - 0.1
         if far and got is not None and math.hypot(*got[:3]) > self.inward * (1 + 1e-6):
-            self.broken("L3", f"{math.hypot(*got[:3]):.3f} m/s pass outside; {self.inward} is permitted")
+            self.breach("L3", f"{math.hypot(*got[:3]):.3f} m/s pass outside; {self.inward} is permitted")
 
     def received(self, at: int, legs: Legs) -> None:
         if self.world_frame:
@@ -768,8 +768,8 @@ class FenceWorld(DrivenWorld):
             where = (
                 f"{-left:.3f} m outside" if self.least == 0 else f"{self.least - left:.3f} m further outside"
             )
-            self.broken(self.law("L3"), f"the base is {where}, at {speed:.2f} m/s")
+            self.breach(self.law("L3"), f"the base is {where}, at {speed:.2f} m/s")
 
     def ended(self) -> None:
         if self.live and self.base.driven < 0.6 * self.honest:
-            self.broken("live", f"the base drives {self.base.driven:.2f} m, not {self.honest:.2f} m")
+            self.breach("live", f"the base drives {self.base.driven:.2f} m, not {self.honest:.2f} m")

@@ -80,7 +80,7 @@ def _text(preset: str, name: str, kind: str) -> str:
     return text_of(Guard(name, chosen, topics, {**side.types, "command": kind}, in_text))
 
 
-def paired(worlds: Mapping[str, type[World]]) -> Callable[..., World]:
+def pair_factory(worlds: Mapping[str, type[World]]) -> Callable[..., World]:
     """Return a function that makes the world of a seed, with a guard of another preset beside its own."""
     firsts = [one for one in worlds if one not in WITHOUT]
 

@@ -129,7 +129,7 @@ class EnableWorld(SwitchWorld):
     def values(self) -> None:
         self.joy = self.random.random() < 0.3
         self.button = self.random.choice((0, 5))
-        self.guarded({**self.common(), "button": self.button}, {"by": JOY if self.joy else BOOL})
+        self.guard_with({**self.common(), "button": self.button}, {"by": JOY if self.joy else BOOL})
 
     def word(self, on: bool) -> bytes:
         return joy([on == (number == self.button) for number in range(8)]) if self.joy else super().word(on)
@@ -170,7 +170,7 @@ class EnableWorld(SwitchWorld):
     def says(self, node: int, on: bool) -> None:
         super().says(node, on)
         if not on and not self.switched_off and self.moves(self.force[1]):
-            self.broken("L3", "a device is let go, and the base is not stopped at once")
+            self.breach("L3", "a device is let go, and the base is not stopped at once")
 
     def _why_not(self, slack: int = 0) -> tuple[str, str] | None:
         """Return the law and the reason that nothing may move."""
@@ -194,9 +194,9 @@ class EnableWorld(SwitchWorld):
             self.ready.add(node)
         if got is not None and self.moves(got):
             if late := self._why_not(SLACK):
-                self.broken(late[0], f"a motion passes, and {late[1]}")
+                self.breach(late[0], f"a motion passes, and {late[1]}")
             if node not in self.ready and not why and self.zero_first:
-                self.broken("L6", f"a motion of node {node} passes that has not stood since the last stop")
+                self.breach("L6", f"a motion of node {node} passes that has not stood since the last stop")
         if self.live and self.now > 2000:
             self.sent, self.passing = self.sent + 1, self.passing + (got == wanted)
 
@@ -211,7 +211,7 @@ class EnableWorld(SwitchWorld):
             and self.moves(self.force[1])
             and self.now > self.fresh_from + 100 + SLACK
         ):
-            self.broken(why[0], f"a motion stays in force, and {why[1]}")
+            self.breach(why[0], f"a motion stays in force, and {why[1]}")
 
     def resume_guard(self) -> None:
         super().resume_guard()
@@ -223,7 +223,7 @@ class EnableWorld(SwitchWorld):
 
     def ended(self) -> None:
         if self.live and self.passing < 0.95 * self.sent:
-            self.broken("live", f"of {self.sent} commands with a held device {self.passing} pass")
+            self.breach("live", f"of {self.sent} commands with a held device {self.passing} pass")
 
 
 class DiagnosticsWorld(EnableWorld):
@@ -234,7 +234,7 @@ class DiagnosticsWorld(EnableWorld):
     def values(self) -> None:
         self.publishers = 1
         self.named, self.warnings = self.random.choice(("*", "motor", "mot*")), self.random.random() < 0.3
-        self.guarded({**self.common(), "named": self.named, "warnings": self.warnings})
+        self.guard_with({**self.common(), "named": self.named, "warnings": self.warnings})
 
     def word(self, on: bool) -> bytes:
         bad, well = (1, 2, 3, 4, -1), (0, 0, 1)
@@ -265,7 +265,7 @@ class ModeWorld(SwitchWorld):
         self.silent = 1.0 if self.live else r.choice((0.0, 0.3, 1.0))
         self.most, self.turn = round(r.uniform(0.1, 0.5), 2), round(r.uniform(0.2, 1), 2)
         self.begun()
-        self.guarded({**self.common(), "vMax": self.most, "wMax": self.turn})
+        self.guard_with({**self.common(), "vMax": self.most, "wMax": self.turn})
         self.drives(
             (1,) if self.live or r.random() < 0.5 else (1, 2),
             (1.5,) if self.live else (self.most * 0.9, 0.7, 1.5, 9.0, 1e300, math.inf, math.nan),
@@ -307,7 +307,7 @@ class ModeWorld(SwitchWorld):
     def says(self, node: int, on: bool) -> None:
         super().says(node, on)
         if on and not self.switched_off and not self._slow(self.force[1]):
-            self.broken("L3", "a switch says manual, and the motion in force stays too fast")
+            self.breach("L3", "a switch says manual, and the motion in force stays too fast")
 
     def _slow(self, legs: Legs, most: float = 1 + 1e-6) -> bool:
         turn = 0.0 if self.kind.startswith("ackermann") else math.hypot(*legs[3:])
@@ -332,11 +332,11 @@ class ModeWorld(SwitchWorld):
             self.ready.add(node)
         if got is not None and not self._slow(got):
             if late := self._why_not(SLACK):
-                self.broken(late[0], f"a fast motion passes, and {late[1]}")
+                self.breach(late[0], f"a fast motion passes, and {late[1]}")
             if node not in self.ready and not why:
-                self.broken("L6", f"a fast motion of node {node} passes that was not slow since manual mode")
+                self.breach("L6", f"a fast motion of node {node} passes that was not slow since manual mode")
             if not all(map(math.isfinite, got)):
-                self.broken("L2", "a velocity that is not a number passes")
+                self.breach("L2", "a velocity that is not a number passes")
         if self.live and self.now > 2500:
             self.sent, self.passing = self.sent + 1, self.passing + (got == wanted)
 
@@ -351,8 +351,8 @@ class ModeWorld(SwitchWorld):
             and not self._slow(self.force[1])
             and self.now > self.fresh_from + 100 + SLACK
         ):
-            self.broken(why[0], f"a fast motion stays in force, and {why[1]}")
+            self.breach(why[0], f"a fast motion stays in force, and {why[1]}")
 
     def ended(self) -> None:
         if self.live and self.passing < 0.95 * self.sent:
-            self.broken("live", f"of {self.sent} commands in automatic mode {self.passing} pass")
+            self.breach("live", f"of {self.sent} commands in automatic mode {self.passing} pass")

@@ -44,7 +44,7 @@ class Fault:
         return None
 
 
-def replaced(old: str, new: str, *, count: int = 0) -> Change:
+def edit(old: str, new: str, *, count: int = 0) -> Change:
     """Replace a regular expression, which must occur."""
 
     def change(text: str) -> str:
@@ -116,89 +116,85 @@ resume_guard, _tell, _restart, _wanted = (
 FAULTS: Mapping[str, Fault] = {
     # L1
     "speed limits the x axis alone": Fault(
-        "L1", "speed", replaced(r"sqrt\(x \* x \+ y \* y \+ z \* z\)", "fabs(x)")
+        "L1", "speed", edit(r"sqrt\(x \* x \+ y \* y \+ z \* z\)", "fabs(x)")
     ),
     "speed clips each axis": Fault(
         "L1",
         "speed",
-        replaced(
+        edit(
             r"x \*= straight; y \*= straight; z \*= straight;",
             "x = clamp(x, -vMax, vMax); y = clamp(y, -vMax, vMax); z = clamp(z, -vMax, vMax);",
         ),
     ),
-    "speed does not limit the growth": Fault("L1", "speed", replaced(r"\baMax \* passed", "vMax")),
+    "speed does not limit the growth": Fault("L1", "speed", edit(r"\baMax \* passed", "vMax")),
     "separation shortens x alone": Fault(
-        "L1", "separation", replaced(r"x \*= part; y \*= part; z \*= part;", "x *= part;")
+        "L1", "separation", edit(r"x \*= part; y \*= part; z \*= part;", "x *= part;")
     ),
     "separation counts x alone": Fault(
         "L1",
         "separation",
-        replaced(r"double v = sqrt\(x \* x \+ y \* y \+ z \* z\)", "double v = fabs(x)"),
+        edit(r"double v = sqrt\(x \* x \+ y \* y \+ z \* z\)", "double v = fabs(x)"),
     ),
-    "sane does not judge the steering": Fault("L1", "sane", replaced(r"!isfinite\(steer\)", "false")),
+    "sane does not judge the steering": Fault("L1", "sane", edit(r"!isfinite\(steer\)", "false")),
     # L2
     "separation takes invalid ranges for far ones": Fault(
-        "L2", "separation", replaced(r"r < low && r != 0 \? 0 : -1", "far")
+        "L2", "separation", edit(r"r < low && r != 0 \? 0 : -1", "far")
     ),
-    "separation takes NaN for far": Fault("L2", "separation", replaced(r"\? 0 : -1;", "? 0 : far;")),
+    "separation takes NaN for far": Fault("L2", "separation", edit(r"\? 0 : -1;", "? 0 : far;")),
     "separation does not ask whether rays cover its way": Fault(
-        "L2", "separation", replaced(r"&& covers\(from, to\)", "")
+        "L2", "separation", edit(r"&& covers\(from, to\)", "")
     ),
     "sensor takes a blind scan": Fault(
-        "L2", "sensor", replaced(r"valid > 0 && valid >= least \* values.size\(\)", "true")
+        "L2", "sensor", edit(r"valid > 0 && valid >= least \* values.size\(\)", "true")
     ),
-    "sensor takes frozen values": Fault("L2", "sensor", replaced(r"repeated < frozen", "true")),
+    "sensor takes frozen values": Fault("L2", "sensor", edit(r"repeated < frozen", "true")),
     "arm takes any charge for enough": Fault(
-        "L2", "ready", replaced(r"left >= charge && left <= most", "!(left < charge)")
+        "L2", "ready", edit(r"left >= charge && left <= most", "!(left < charge)")
     ),
-    "agree compares the linear velocity alone": Fault("L2", "agree", replaced(r"&& turned <= turning", "")),
+    "agree compares the linear velocity alone": Fault("L2", "agree", edit(r"&& turned <= turning", "")),
     "fence takes any quaternion for a heading": Fault(
-        "L2", "fence", replaced(r"fabs\(norm - 1\) <= 0.1 \?", "true ?")
+        "L2", "fence", edit(r"fabs\(norm - 1\) <= 0.1 \?", "true ?")
     ),
     # L3
     "separation forgets the age of the scan": Fault(
-        "L3", "separation", replaced(r"double delay = reaction \+ 0.02;", "double delay = 0;")
+        "L3", "separation", edit(r"double delay = reaction \+ 0.02;", "double delay = 0;")
     ),
-    "separation forgets the person": Fault("L3", "separation", replaced(r"person \* \(", "0 * (")),
-    "separation judges no scan": Fault("L3", "separation", replaced(r"if \(lastV > 0\) \{", "if (false) {")),
-    "separation judges no tick": Fault("L3", "separation", replaced(r"if \(lastV > 0 &&", "if (false &&")),
-    "fence forgets how long the base needs": Fault("L3", "fence", replaced(r"\bahead\b(?! =)", "0.0")),
+    "separation forgets the person": Fault("L3", "separation", edit(r"person \* \(", "0 * (")),
+    "separation judges no scan": Fault("L3", "separation", edit(r"if \(lastV > 0\) \{", "if (false) {")),
+    "separation judges no tick": Fault("L3", "separation", edit(r"if \(lastV > 0 &&", "if (false &&")),
+    "fence forgets how long the base needs": Fault("L3", "fence", edit(r"\bahead\b(?! =)", "0.0")),
     "fence forgets its margin": Fault(
-        "L3", "fence", replaced(r"fmax\(margin \+ part \* swing \+ stray, between\)", "-1")
+        "L3", "fence", edit(r"fmax\(margin \+ part \* swing \+ stray, between\)", "-1")
     ),
     "deadman never ends a motion": Fault(
-        "L3", "deadman", replaced(r"if \(stopped && pause == 0\)", "if (false)")
+        "L3", "deadman", edit(r"if \(stopped && pause == 0\)", "if (false)")
     ),
-    "deadman waits twice as long": Fault("L3", "deadman", replaced(r"At <= silent", "At <= 2 * silent")),
-    "rate drops slower commands": Fault("L3", "rate", replaced(r"&& !slower", "")),
+    "deadman waits twice as long": Fault("L3", "deadman", edit(r"At <= silent", "At <= 2 * silent")),
+    "rate drops slower commands": Fault("L3", "rate", edit(r"&& !slower", "")),
     "the base of separation brakes at half of what it declares": Fault(
         "L3", "separation", patch=(Base, "wanted_by", _slow)
     ),
     "the base of fence is later than it declares": Fault("L3", "fence", patch=(Base, "order", _late)),
     # L4
     "estop has one button": Fault(
-        "L4", "estop", replaced(r"index\(buttons, caller\(button\)\)", "buttons.size() - 1")
+        "L4", "estop", edit(r"index\(buttons, caller\(button\)\)", "buttons.size() - 1")
     ),
-    "estop has one hand": Fault(
-        "L4", "estop", replaced(r"index\(hands, caller\(again\)\)", "hands.size() - 1")
-    ),
-    "estop counts a hand twice": Fault("L4", "estop", replaced(r"&& i != place", "")),
+    "estop has one hand": Fault("L4", "estop", edit(r"index\(hands, caller\(again\)\)", "hands.size() - 1")),
+    "estop counts a hand twice": Fault("L4", "estop", edit(r"&& i != place", "")),
     "estop hears any button": Fault(
-        "L4", "estop", replaced(r"!\(now - heard\[i\] <= silent\)", "!(now - heard[0] <= silent)")
+        "L4", "estop", edit(r"!\(now - heard\[i\] <= silent\)", "!(now - heard[0] <= silent)")
     ),
     "deadman knows one node": Fault(
-        "L4", "deadman", replaced(r'caller\(drive\) == "" \? "a node" : caller\(drive\)', '"a node"')
+        "L4", "deadman", edit(r'caller\(drive\) == "" \? "a node" : caller\(drive\)', '"a node"')
     ),
     "sensor takes another node for its sensor": Fault(
-        "L4", "sensor", replaced(r"caller\(sense\) == source", "true")
+        "L4", "sensor", edit(r"caller\(sense\) == source", "true")
     ),
     "arm takes another battery for its own": Fault(
-        "L4", "ready", replaced(r"caller\(battery\) == batteryNode", "true")
+        "L4", "ready", edit(r"caller\(battery\) == batteryNode", "true")
     ),
     # L5
-    "estop begins anew after its state is lost": Fault(
-        "L5", "estop", replaced(r"(?m)^estop\(", "begin estop(")
-    ),
+    "estop begins anew after its state is lost": Fault("L5", "estop", edit(r"(?m)^estop\(", "begin estop(")),
     "a hold drops observed messages": Fault("L5", "estop", patch=(RunningGuard, "tell", _deaf)),
     "a hold of a fence drops observed messages": Fault("L5", "fence", patch=(RunningGuard, "tell", _deaf)),
     "a guard hears nothing while it holds": Fault("L5", "estop", patch=(RunningGuard, "tell", _blind)),
@@ -207,18 +203,18 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "a hold holds nothing": Fault("L5", "deadman", patch=(RunningGuard, "hold", lambda _guard: None)),
     # L6
-    "deadman takes the first command after a silence": Fault("L6", "deadman", replaced(r">= resume", ">= 0")),
-    "estop needs no zero": Fault("L6", "estop", replaced(r"zeroFirst\)", "false)")),
+    "deadman takes the first command after a silence": Fault("L6", "deadman", edit(r">= resume", ">= 0")),
+    "estop needs no zero": Fault("L6", "estop", edit(r"zeroFirst\)", "false)")),
     "estop takes the zero of any node": Fault(
-        "L6", "estop", replaced(r"standing == one \|\| standingToo == one", 'standing != ""')
+        "L6", "estop", edit(r"standing == one \|\| standingToo == one", 'standing != ""')
     ),
     "estop takes a zero from before the stop": Fault(
-        "L6", "estop", replaced(r"if \(!released \|\| latched\)", "if (false)")
+        "L6", "estop", edit(r"if \(!released \|\| latched\)", "if (false)")
     ),
     "estop takes a key that is stuck": Fault(
         "L6",
         "estop",
-        replaced(r"(pressed) && down\[place\] == 0|(latched && released) && moved.*?0\.1", r"\1\2"),
+        edit(r"(pressed) && down\[place\] == 0|(latched && released) && moved.*?0\.1", r"\1\2"),
     ),
     "a restarted guard sends no stop": Fault("L6", "speed", patch=(RunningGuard, "restart", _left_as_it_was)),
 }
@@ -366,14 +362,14 @@ _TERMS: Sequence[tuple[str, str, str, str]] = (
     ("fence", "judges no position", r"lastV > 0 && permitted\(lastV", "false && permitted(lastV"),
 )  # fmt: skip
 TERMS = {
-    f"{preset} {what}": Fault("live" if "interval" in what else "L3", preset, replaced(old, to))
+    f"{preset} {what}": Fault("live" if "interval" in what else "L3", preset, edit(old, to))
     for preset, what, old, to in _TERMS
 }
 """Each forgets a term; the worlds without reserve, at the first seeds, must find it."""
 FAULTS = {
     **FAULTS,
     **TERMS,
-    **{f"{preset} {what}": Fault(law, preset, replaced(old, to)) for law, preset, what, old, to in _ROWS},
+    **{f"{preset} {what}": Fault(law, preset, edit(old, to)) for law, preset, what, old, to in _ROWS},
     **{
         f"a hold of {preset} holds nothing": Fault("L5", preset, patch=(RunningGuard, "hold", lambda _guard: None))
         for preset in (

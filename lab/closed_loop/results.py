@@ -89,7 +89,7 @@ def rows_of(summaries: Mapping[str, Summary], firsts: Mapping[str, int], commit:
     }
 
 
-def parsed(run: Mapping[str, Any]) -> Rows:
+def parse_rows(run: Mapping[str, Any]) -> Rows:
     """Return the rows of a file, also of one that names one commit for all of them."""
     if "rows" in run:
         return {name: Row(**row) for name, row in run["rows"].items()}
@@ -107,7 +107,7 @@ def as_data(rows: Rows) -> dict[str, Any]:
     return {"rows": {name: row.data() for name, row in rows.items()}}
 
 
-def joined(runs: Sequence[Rows], digests: Mapping[str, str]) -> tuple[Rows, list[str]]:
+def join_runs(runs: Sequence[Rows], digests: Mapping[str, str]) -> tuple[Rows, list[str]]:
     """Return the sums of the runs, and for each row that is left out why: its worlds ran another text.
 
     Raises:
@@ -137,15 +137,15 @@ def _sum(name: str, one: Row, other: Row) -> Row:
         worlds=one.worlds + other.worlds,
         seconds=one.seconds + other.seconds,
         closest=min(near, default=None),
-        violations=_added(one.violations, other.violations),
+        violations=_add(one.violations, other.violations),
         date=max(one.date, other.date),
-        commits=_added(one.commits, other.commits),
-        acts=_added(one.acts, other.acts),
-        honest=_added(one.honest, other.honest),
+        commits=_add(one.commits, other.commits),
+        acts=_add(one.acts, other.acts),
+        honest=_add(one.honest, other.honest),
     )
 
 
-def continued(rows: Rows, run: Rows) -> Rows:
+def continue_rows(rows: Rows, run: Rows) -> Rows:
     """Return `rows` with the worlds of a later run; a row of another text is replaced.
 
     Raises:
@@ -158,13 +158,13 @@ def continued(rows: Rows, run: Rows) -> Rows:
     }
 
 
-def _added(one: Mapping[str, int], other: Mapping[str, int]) -> dict[str, int]:
+def _add(one: Mapping[str, int], other: Mapping[str, int]) -> dict[str, int]:
     counts = Counter(one)
     counts.update(other)
     return dict(counts)
 
 
-def corrected(rows: Rows, again: Rows) -> Rows:
+def correct_rows(rows: Rows, again: Rows) -> Rows:
     """Return `rows` with the rows of `again`, which ran the same worlds later, after a correction of the rig.
 
     Raises:

@@ -336,14 +336,14 @@ def cancelled(w: "JointsWorld") -> float:
     return begin - w.time + 0.5
 
 
-def made(w: "JointsWorld", bad: str) -> Sent:
+def make_sent(w: "JointsWorld", bad: str) -> Sent:
     names, points = DAMAGE[bad](w, w.walk())
     return Sent(points, names=names, bad=bad)
 
 
 def wrong(w: "JointsWorld", bad: str = "") -> None:
     bad = bad or w.random.choice([*DAMAGE])
-    w.send(Sent((), bad=bad) if bad == "empty" else made(w, bad))
+    w.send(Sent((), bad=bad) if bad == "empty" else make_sent(w, bad))
     if w.random.random() < 0.3:  # a goal that is wrong stops nothing
         preempt(w)
 
@@ -424,7 +424,7 @@ def _bending(world: "JointsWorld", points: list[Point]) -> Damaged:
     def beyond(far: float, fast: float) -> bool:
         return far >= 1.01 * world.most or fast >= 1.01 * OVERSHOOT * world.fastest
 
-    found = world.bent(points, beyond)
+    found = world.bend(points, beyond)
     if beyond(*extremes(found)):
         return JOINTS, found
     out = tuple(math.copysign(world.fastest, position) for position in last.positions)

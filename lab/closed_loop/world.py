@@ -156,7 +156,7 @@ class World:
         self._number = 0
 
     def plan(self) -> None:
-        """Set up the world: call `guarded`, and `after` for everything that happens."""
+        """Set up the world: call `guard_with`, and `after` for everything that happens."""
         raise NotImplementedError
 
     def watch(self) -> None:
@@ -173,7 +173,7 @@ class World:
 
     # For `plan`
 
-    def guarded(self, values: Mapping[str, Value], types: Mapping[str, str] | None = None) -> None:
+    def guard_with(self, values: Mapping[str, Value], types: Mapping[str, str] | None = None) -> None:
         types = {COMMAND: self.kind, **(types or {})}
         values = {name: value for name, value in values.items() if name in parameters_of(self.preset)}
         beside = None if self.beside is None else self.beside.begin()
@@ -204,7 +204,7 @@ class World:
         if self._trace is not None:
             self._trace(f"{self.now / 1000:8.3f}  {text}")
 
-    def broken(self, law: str, text: str) -> None:
+    def breach(self, law: str, text: str) -> None:
         if law == "live" and self.beside is not None:
             return
         self.report.violations.append(Violation(law, self.now, text))
@@ -261,7 +261,7 @@ class World:
         for one in sent:
             self.receive(*one)
         if passed is None and held and whole and given != COMMAND:
-            self.broken(
+            self.breach(
                 "L5", f"a guard that holds drops a message on {self.guard.topics[given]}, which it observes"
             )
         return passed
@@ -284,10 +284,10 @@ class World:
             if passed != data:
                 self._shortened(legs, got)
             if self.moves(got) and (self.holding or self.guard.holds):
-                self.broken("L5", f"a motion passes a guard that holds: {_shown(got)}")
+                self.breach("L5", f"a motion passes a guard that holds: {_shown(got)}")
         if not self.switched_off:
             if got is not None and self.is_motion(got) and (why := self.beside_source()):
-                self.broken("L4", f"a motion passes: {why}")
+                self.breach("L4", f"a motion passes: {why}")
             self.passed(node, legs, got)
         return got
 
@@ -301,7 +301,7 @@ class World:
         if scale > 1 + 1e-9 or any(
             not abs(leg * scale - other) <= near for leg, other in zip(wanted[:3], got[:3], strict=True)
         ):
-            self.broken("L1", f"{_shown(wanted)} becomes {_shown(got)}: another direction, or more")
+            self.breach("L1", f"{_shown(wanted)} becomes {_shown(got)}: another direction, or more")
 
     # Another node beside the source
 
@@ -415,7 +415,7 @@ class World:
         if self.switched_off or self.guard.holds or self.now <= self.fresh_from + 100 + slack:
             return
         if (why := self.beside_source(slack)) and self.is_motion(self.force[1]):
-            self.broken("L4", f"a motion stays in force: {why}")
+            self.breach("L4", f"a motion stays in force: {why}")
 
     # Acts of operators
 
@@ -497,7 +497,7 @@ class World:
             return
         if self.now > self.fresh_from + 100 + SLACK:
             ago = (self.fresh_from - at) / 1000
-            self.broken(
+            self.breach(
                 "L6", f"{_shown(legs)} is in force, which came {ago:.2f} s before the guard began again"
             )
 

@@ -12,7 +12,7 @@ from lab.closed_loop.evidence import AgreeWorld, ArmWorld, SensorWorld
 from lab.closed_loop.limits import RateWorld, SaneWorld, SpeedWorld
 from lab.closed_loop.measured import OverspeedWorld, StandstillWorld
 from lab.closed_loop.motion import FenceWorld, SeparationWorld
-from lab.closed_loop.pairs import SIDES, WITHOUT, paired
+from lab.closed_loop.pairs import SIDES, WITHOUT, pair_factory
 from lab.closed_loop.people import DiagnosticsWorld, EnableWorld, ModeWorld
 from lab.closed_loop.world import LAWS, Report, World
 from lab.closed_loop.zones import ZoneWorld
@@ -29,7 +29,7 @@ WORLDS: dict[str, type[World]] = {
 
 PAIRS = "pairs"
 """Stands for a preset where worlds have two guards, of presets that the seed chooses."""
-_PAIRS = paired(WORLDS)
+_PAIRS = pair_factory(WORLDS)
 IN_PAIRS = (WORLDS.keys() - WITHOUT.keys()) | SIDES.keys()
 """The presets that take part in pairs."""
 

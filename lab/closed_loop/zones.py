@@ -39,7 +39,7 @@ class ZoneWorld(SeparationWorld):
         self.slow = 0.0 if self.live or r.random() < 0.7 else 0.2
         self.points = r.choice((1, 2, 3))
         lag, braking, top = r.randrange(10, 120), r.uniform(1, 3), r.choice((0.3, 0.6, 1.0))
-        self.built(
+        self.build(
             (DIFFERENTIAL,) if self.live else (DIFFERENTIAL, OMNIDIRECTIONAL, STEERED), lag, braking, top
         )
         self.unseen, self.blank = (
@@ -48,7 +48,7 @@ class ZoneWorld(SeparationWorld):
         )
         self.turn, self.restarts = r.choice((0.0, 0.0, 0.3)), r.random() < 0.2
         self.radius, delay = r.uniform(0.15, 0.3), r.uniform(0, 100)
-        self.shaped(0.0)
+        self.shape(0.0)
         self.own = 0.1 if not self.live and r.random() < 0.2 else 0.0
         swing = self.base.turn_top * math.hypot(*self.base.sensor[:2])
         seconds = self.silent + (delay + lag + self.tick) / 1000 + 0.02
@@ -79,14 +79,14 @@ class ZoneWorld(SeparationWorld):
             "muteFor": MUTED if mutes else 0.0, "turn": self.turn, "restarts": self.restarts, "own": self.own,
             "blankIsFree": self.blank is not None, "polygon": " ".join(f"{x},{y}" for x, y in self.corners),
         }  # fmt: skip
-        self.guarded(values, {"by": SCAN})
+        self.guard_with(values, {"by": SCAN})
         self.scanner(r.uniform(25, self.silent * 850), delay)
         if self.live:
             self.every(
                 lambda: 100, lambda: void(self.drive(straight(self.honest[0] * (self.now > 1200)))), first=50
             )
             return
-        self.driven(tuple((one.x, one.y) for one in self.persons) + tuple((w[0], w[1]) for w in self.walls))
+        self.drive_to(tuple((one.x, one.y) for one in self.persons) + tuple((w[0], w[1]) for w in self.walls))
         self.every(lambda: r.uniform(300, 1500), lambda: void(self.drive(STILL)), first=r.uniform(0, 1000))
         if mutes:
             self.after(r.uniform(500, 4000), self._mute)
@@ -232,11 +232,11 @@ class ZoneWorld(SeparationWorld):
         if got is None or not self._fast(got):
             return
         if self.now < self.occupied_at + self.clear * 1000 and self.now > self.fresh_from:
-            self.broken(
+            self.breach(
                 self._law(), f"a motion passes, though something was in the zone at {self.occupied_at} ms"
             )
         if node not in self.ready and not self.slow and not self.restarts:
-            self.broken("L6", "a motion passes of a node that has not stood since the last stop")
+            self.breach("L6", "a motion passes of a node that has not stood since the last stop")
 
     def begins_again(self) -> None:
         super().begins_again()
@@ -254,5 +254,5 @@ class ZoneWorld(SeparationWorld):
         if self._fast(self.force[1]):
             since = self.now if self.occupied_since is None or self.foreign else self.occupied_since
             if self.now > since + self.tick + SLACK:
-                self.broken("L3", f"something is in the zone since {since} ms, and the base is not stopped")
+                self.breach("L3", f"something is in the zone since {since} ms, and the base is not stopped")
             self.evidence(self.silent)

@@ -57,7 +57,7 @@ class TraceBounds:
         return LEASE
 
     @property
-    def defined(self) -> list[str]:
+    def defines(self) -> list[str]:
         return [f"-DFIRST={self.first}", f"-DGRANTS={self.last}"]
 
 

@@ -45,7 +45,7 @@ class ModelBounds(Protocol):
     def model(self) -> Model: ...
 
     @property
-    def defined(self) -> list[str]: ...
+    def defines(self) -> list[str]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class LeaseBounds:
         return LEASE
 
     @property
-    def defined(self) -> list[str]:
+    def defines(self) -> list[str]:
         return [f"-DGRANTS={self.grants}"] + ["-DLAST_FAULT"] * self.last_fault
 
 
@@ -81,7 +81,7 @@ class FollowerBounds:
         return FOLLOWER
 
     @property
-    def defined(self) -> list[str]:
+    def defines(self) -> list[str]:
         return [f"-DEXPIRY={self.expiry}", f"-DWRITE={self.write}"] + ["-DSERVED"] * self.served
 
 
@@ -111,7 +111,7 @@ class Bounds:
         return INSERTION
 
     @property
-    def defined(self) -> list[str]:
+    def defines(self) -> list[str]:
         numbers = {
             "PUBLISHERS": self.publishers,
             "SUBSCRIBERS": self.subscribers,
@@ -138,7 +138,7 @@ def search(
     """
     spin, compiler = need_program("spin", "spin"), need_program("gcc", "g++")
     wrong = [f"-DMUTANT_{mutant}"] if mutant else []
-    _run(folder, spin, "-a", *bounds.defined, *wrong, str(traced or bounds.model.path))
+    _run(folder, spin, "-a", *bounds.defines, *wrong, str(traced or bounds.model.path))
     _run(
         folder,
         compiler,

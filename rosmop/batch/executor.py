@@ -31,7 +31,7 @@ class Executor(Protocol):
 
     def submit(self, number: int, job: bytes) -> None: ...
 
-    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+    def collect(self) -> list[tuple[int, bytes | WorkerDeath]]:
         """Wait until at least one submitted job has ended."""
 
     def close(self) -> None: ...
@@ -49,7 +49,7 @@ class ThisProcess:
     def submit(self, number: int, job: bytes) -> None:
         self._waiting.append((number, job))
 
-    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+    def collect(self) -> list[tuple[int, bytes | WorkerDeath]]:
         number, job = self._waiting.popleft()
         return [(number, self._work(job))]
 
@@ -78,7 +78,7 @@ def execute(
             executor.submit(number, job)
         if not running:
             return
-        for number, result in executor.finished():
+        for number, result in executor.collect():
             job = running.pop(number)
             if isinstance(result, WorkerDeath) and attempts[number] < ATTEMPTS:
                 again.append((number, job))

@@ -14,10 +14,10 @@ from pathlib import Path
 import msgspec
 
 from rosmop.batch.recording_list import RecordingName, local_recording
-from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replayed
+from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replay_recording
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
-from rosmop.learn.exercised import covered
+from rosmop.learn.exercised import coverage
 from rosmop.learn.passes import AlarmFacts, AnyStep, ContentFacts, TimeFacts, facts_of
 from rosmop.learn.recordings import LearningError
 from rosmop.recordings.recording import RecordedFile, RecordingError, definitions_of, open_recording
@@ -94,11 +94,11 @@ class _Envelope(msgspec.Struct, frozen=True):
     job: Job
 
 
-def packed(job: Job) -> bytes:
+def to_bytes(job: Job) -> bytes:
     return msgspec.msgpack.encode(_Envelope(_version(), job))
 
 
-def unpacked(result: bytes) -> Result | Failure:
+def unpack(result: bytes) -> Result | Failure:
     decoded: Result | Failure = msgspec.msgpack.decode(result, type=Result | Failure)
     return decoded
 
@@ -153,7 +153,7 @@ def _result(job: Job) -> Result:
     name = Path(job.recording.uri).name
     with local_file(job.recording) as path:
         if isinstance(job, ReplayJob):
-            return replayed(job, path)
+            return replay_recording(job, path)
         if isinstance(job, SurveyJob):
             recording = RecordedFile(path, job.topics, name)
             definitions: dict[str, str] = {}
@@ -164,7 +164,7 @@ def _result(job: Job) -> Result:
                 recording.name, recording.began, recording.ended, recording.topics, definitions, recording.notes
             )  # fmt: skip
         if isinstance(job, LearnJob):
-            known = standard_definitions().extended(definitions_by_type(job.definitions))
+            known = standard_definitions().merge(definitions_by_type(job.definitions))
             topics = job.step.topics
             return facts_of(job.step, RecordedFile(path, list(topics), name, topics, known), known)
         return _coverage(job, path, name)
@@ -172,13 +172,13 @@ def _result(job: Job) -> Result:
 
 def _coverage(job: CoverageJob, path: Path, name: str) -> Coverage:
     with closing(open_recording(path)) as reader:
-        known = job.specifications.known(definitions_of(reader))
+        known = job.specifications.merge(definitions_of(reader))
         monitors = MonitorSet.of(compiled_from(job.specifications.texts, known))
         notes = [
             f"{job.recording.uri}: {text}" for text in refusals(monitors, reader, strict=job.recording.uri)
         ]
     recording = RecordedFile(path, ["*"], name, monitors.topics, known)
-    return Coverage(covered(job.specifications.texts, known, recording), notes)
+    return Coverage(coverage(job.specifications.texts, known, recording), notes)
 
 
 def definitions_by_type(texts: dict[str, str]) -> Definitions:

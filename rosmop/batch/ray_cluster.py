@@ -53,7 +53,7 @@ class RayCluster:
         with _reached():
             self._running[self._task.remote(job)] = number
 
-    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+    def collect(self) -> list[tuple[int, bytes | WorkerDeath]]:
         with _reached():
             (ready,), _others = self._ray.wait(list(self._running), num_returns=1)
             number = self._running.pop(ready)

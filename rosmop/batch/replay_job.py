@@ -15,7 +15,7 @@ from rosmop.recordings.recording import OWN, Reader, definitions_of, open_record
 from rosmop.recordings.replay import ReplayStep, refusals, replay
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
-from rosmop.run.outcomes import Outcome, Verdict, bound, why_of
+from rosmop.run.outcomes import Outcome, Verdict, binding, why_of
 from rosmop.run.slices import LIMIT
 from rosmop.run.why_lines import lines_of_why
 from roswire.definitions import Definitions
@@ -40,13 +40,13 @@ class Specifications(msgspec.Struct, frozen=True):
     on_fault: OnFault = "drop"
     slices: int = LIMIT
 
-    def known(self, recorded: Definitions) -> Definitions:
+    def merge(self, recorded: Definitions) -> Definitions:
         """Return the definitions of the recording, of ROS, and the given ones; later ones replace earlier ones."""
-        own = standard_definitions().extended(Definitions.from_files(self.definitions))
-        return recorded.extended(own)
+        own = standard_definitions().merge(Definitions.from_files(self.definitions))
+        return recorded.merge(own)
 
     def monitors(self, recorded: Definitions, *, margins: bool = False) -> MonitorSet:
-        compiled = compiled_from(self.texts, self.known(recorded), margins=margins, topics=self.topics)
+        compiled = compiled_from(self.texts, self.merge(recorded), margins=margins, topics=self.topics)
         fast = fast_path_of(compiled) if find_spec("wasmtime") is not None else None
         monitors: MonitorSet = MonitorSet.of(
             compiled,
@@ -141,7 +141,7 @@ class Found(NamedTuple):
     text: str
 
 
-def replayed(job: ReplayJob, path: Path) -> Replayed:
+def replay_recording(job: ReplayJob, path: Path) -> Replayed:
     with closing(open_recording(path)) as reader:
         monitors = job.specifications.monitors(definitions_of(reader), margins=job.margins)
         strict = job.recording.uri if job.strict else None
@@ -203,7 +203,7 @@ def _found(outcome: Outcome) -> Iterator[Found]:
         own = [event for event in outcome.changed_by if event.startswith(f"{monitor}.")]
         yield Found(monitor, "change", ", ".join(own))
     for verdict in outcome.verdicts:
-        text = f"{verdict.category} of property {verdict.property + 1} ({verdict.logic}){bound(verdict)}"
+        text = f"{verdict.category} of property {verdict.property + 1} ({verdict.logic}){binding(verdict)}"
         yield Found(verdict.monitor, "verdict", "; ".join((text, *because(verdict))))
     for line in outcome.log:
         if line.level not in ("DEBUG", "INFO"):

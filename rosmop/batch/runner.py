@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 import msgspec
 
 from rosmop.batch.executor import Executor, ThisProcess, Work, WorkerDeath, execute
-from rosmop.batch.jobs import Failure, Job, Result, packed, unpacked, work
+from rosmop.batch.jobs import Failure, Job, Result, to_bytes, unpack, work
 from rosmop.batch.journal import ResumeJournal, TemporaryStore
 from rosmop.batch.ray_cluster import RayCluster
 
@@ -44,11 +44,11 @@ class ProcessPool:
                 if not is_new:  # it died while it was idle
                     _end(process, pipe)
                     continue
-            # A new process that died is noticed by `finished`.
+            # A new process that died is noticed by `collect`.
             self._running[pipe] = process, number
             return
 
-    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+    def collect(self) -> list[tuple[int, bytes | WorkerDeath]]:
         results: list[tuple[int, bytes | WorkerDeath]] = []
         for pipe in wait(list(self._running)):
             assert isinstance(pipe, Connection)  # noqa: S101  for mypy: no others are waited for
@@ -123,23 +123,25 @@ class JobRunner:
     ) -> Iterator[tuple[int, Result | Failure]]:
         waiting: list[int] = []
         for number, job in enumerate(jobs):
-            known = self.journal.result(packed(job)) if self.journal is not None else None
+            known = self.journal.result(to_bytes(job)) if self.journal is not None else None
             if known is None:
                 waiting.append(number)
                 continue
             done(number)
-            yield number, unpacked(known)
-        for number, answer in execute(self.executor, ((number, packed(jobs[number])) for number in waiting)):
+            yield number, unpack(known)
+        for number, answer in execute(
+            self.executor, ((number, to_bytes(jobs[number])) for number in waiting)
+        ):
             if isinstance(answer, WorkerDeath):
                 done(number)
                 yield number, Failure(answer.reason)
                 continue
             try:
-                result = unpacked(answer)
+                result = unpack(answer)
             except ValueError as error:
                 result = Failure(f"its worker answered something else: {error}")
             if self.journal is not None and not isinstance(result, Failure):
-                self.journal.add(packed(jobs[number]), answer)
+                self.journal.add(to_bytes(jobs[number]), answer)
             done(number)
             yield number, result
 
@@ -156,7 +158,7 @@ class JobRunner:
                 yield result
                 following += 1
                 while following in places:
-                    yield unpacked(early.read(places.pop(following)))
+                    yield unpack(early.read(places.pop(following)))
                     following += 1
 
 

@@ -118,7 +118,7 @@ class PastGuesses:
         self.formula = self._over(formula)
         self.rules = [rule for node in self._guessed for rule in self._rules(node)]
 
-    def kept(self, formula: Node) -> Node:
+    def with_rules(self, formula: Node) -> Node:
         return reduce(lambda left, right: ("and", left, right), self.rules, formula)
 
     def _over(self, node: Node) -> Node:
@@ -362,7 +362,7 @@ def _check_endless(
     guesses = PastGuesses(formula, letters)
     future = FutureFollower(guesses.count, MAX_WORK)
     sides = (guesses.formula, ("not", guesses.formula))
-    start = tuple(future.start(positive(guesses.kept(side), guesses.count)) for side in sides)
+    start = tuple(future.start(positive(guesses.with_rules(side), guesses.count)) for side in sides)
 
     def step(state: tuple[State, ...], event: str) -> tuple[State, ...]:
         return tuple(future.steps(side, guesses.letters[event]) for side in state)

@@ -24,7 +24,7 @@ _NO_RESULT, _LOOP, _IF, _END = b"\x40", b"\x03", b"\x04", b"\x0b"
 _COPY_MEMORY = b"\xfc\x0a\x00\x00"
 
 
-def scripted(module: WasmModule) -> bytes:
+def to_script(module: WasmModule) -> bytes:
     sections = sections_of(module.code)
     types, chosen = list(_types(sections[1])), list(_chosen(sections[3]))
     exports = _exports(sections[7])

@@ -21,10 +21,10 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
-from rosmop.certify.scripted_module import NOTE, RECORD, SCRIPT, TELL, scripted
+from rosmop.certify.scripted_module import NOTE, RECORD, SCRIPT, TELL, to_script
 from rosmop.fast.abi import AREA, LEFT, SOONER, TOLD, Cells
 from rosmop.fast.batch_codegen import WasmModule
-from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translate
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import SpecificationGroup, groups
@@ -139,7 +139,7 @@ class ExpectedTopic:
         }
         self.clocked = any(isinstance(one.compiled, ClockedProperty) for one in self.properties.values())
 
-    def begun(self) -> States:
+    def initial_states(self) -> States:
         return dict(self._begun)
 
     def walk(self, states: States, case: StepCase) -> ExpectedResult:
@@ -251,7 +251,7 @@ def check_steps(compiled: Compiled, module: WasmModule) -> int:
     if not module.feeds:
         return 0
     pairs = MAX
-    machine = WasmInstance(translated(scripted(module), module.memory), module.memory)
+    machine = WasmInstance(translate(to_script(module), module.memory), module.memory)
     benches = []
     for group, cells in zip(groups(compiled.specifications), module.cells, strict=True):
         for (name, _), numbers in zip(group.component.topics, group.events, strict=True):
@@ -379,7 +379,7 @@ class _Bench:
         return states
 
     def _sweep(self, case: StepCase, one: PropertyStep | None, first: int, behind: int) -> None:
-        begun = self._topic.begun()
+        begun = self._topic.initial_states()
         if case.beside is not None:
             begun[case.beside[0]] = case.beside[1]
         if one is not None and self._topic.clocked:

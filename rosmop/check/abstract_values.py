@@ -110,7 +110,7 @@ class PathState:
     """The sites that assigned a field."""
     result: AbstractValue = ANYTHING
 
-    def branched(self) -> "PathState":
+    def branch(self) -> "PathState":
         return PathState(
             dict(self.values), self.skipped, self.control, self.inputs, self.fate, self.spoke, self.written,
             self.result,
@@ -124,7 +124,7 @@ class PathState:
         self.values[name] = value._replace(inputs=value.inputs | self.inputs)
 
 
-def joined(one: AbstractValue | None, other: AbstractValue | None) -> AbstractValue:
+def join(one: AbstractValue | None, other: AbstractValue | None) -> AbstractValue:
     if one is None or other is None or one == other:
         return one if one is not None else other if other is not None else AbstractValue()
     inputs = one.inputs | other.inputs
@@ -136,14 +136,12 @@ def joined(one: AbstractValue | None, other: AbstractValue | None) -> AbstractVa
     if isinstance(one.known, AbstractParts) and isinstance(other.known, AbstractParts):
         paths = {*one.known.parts, *other.known.parts}
         parts = {
-            path: joined(
+            path: join(
                 one.known.parts.get(path, one.known.others), other.known.parts.get(path, other.known.others)
             )
             for path in paths
         }
-        return AbstractValue(
-            AbstractParts(parts, joined(one.known.others, other.known.others)), inputs=inputs
-        )
+        return AbstractValue(AbstractParts(parts, join(one.known.others, other.known.others)), inputs=inputs)
     true, false = EMPTY, EMPTY
     for value in (one, other):
         true |= value.less_true | (value.why if value.known is False else EMPTY)
@@ -157,22 +155,22 @@ def _same(one: object, other: object) -> bool:
     return type(one) is type(other) and one == other
 
 
-def merged(states: Iterable[PathState]) -> PathState:
+def merge(states: Iterable[PathState]) -> PathState:
     first, *rest = states
-    made = first.branched()
+    made = first.branch()
     for state in rest:
         for name in made.values.keys() - state.values.keys():
-            made.values[name] = joined(made.values[name], unset(name))
+            made.values[name] = join(made.values[name], unset(name))
         for name, theirs in state.values.items():
             ours = made.values.get(name)
             if ours is not theirs:
-                made.values[name] = joined(unset(name) if ours is None else ours, theirs)
+                made.values[name] = join(unset(name) if ours is None else ours, theirs)
         made.skipped |= state.skipped
         made.control |= state.control
         made.inputs |= state.inputs
         made.written |= state.written
         made.spoke = made.spoke or state.spoke
-        made.result = joined(made.result, state.result)
+        made.result = join(made.result, state.result)
     return made
 
 
@@ -224,6 +222,6 @@ def of_compared(value: AbstractValue) -> Places:
     return value.why
 
 
-def negated(value: AbstractValue) -> AbstractValue:
+def negate(value: AbstractValue) -> AbstractValue:
     known = value.known if value.known is UNKNOWN else not value.known
     return value._replace(known=known, less_true=value.less_false, less_false=value.less_true)

@@ -52,7 +52,7 @@ def note_copy(target: Value, value: Value) -> None:
 
 def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes.Expression:
     stored = _store(scope, require_place(target, "an assignment"), value)
-    return marked(mark(scope, target), stored)
+    return with_mark(mark(scope, target), stored)
 
 
 def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) -> None:
@@ -63,7 +63,7 @@ def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) ->
         scope.evaluate(nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True)))
 
 
-def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
+def with_mark(flag: str | None, change: nodes.Expression) -> nodes.Expression:
     if flag is None:
         return change
     assigned = nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True))

@@ -9,7 +9,7 @@ from rosmop.check.assignables import Value, path, root
 from rosmop.check.assignments import require_place, store
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.invocation import MemberCall
-from rosmop.check.print_statements import OutputStream, formatted
+from rosmop.check.print_statements import OutputStream, compile_format
 from rosmop.check.scope import ConstantReference, FunctionScope, HelperFunction
 from rosmop.check.standard_functions import LIBRARY, Arguments, find_function
 from rosmop.form import nodes
@@ -17,7 +17,7 @@ from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
-from rosmop.types.messages import nearest, shown
+from rosmop.types.messages import nearest, quote
 from rosmop.types.resolve import named_type, record
 from rosmop.types.value_types import Type
 from roswire.counted import counted
@@ -25,7 +25,7 @@ from roswire.counted import counted
 # Compile initial and assigned values: converted expressions, or `{a, b, c}` for a vector.
 
 
-def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> nodes.Expression:
+def convert_value(scope: FunctionScope, node: tree.Expression, target: Type) -> nodes.Expression:
     if isinstance(node, tree.InitializerList):
         return elements(scope, node, target)
     return convert(scope, scope.value_of(node), target, scope.site(node))
@@ -34,7 +34,7 @@ def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> node
 def elements(scope: FunctionScope, node: tree.InitializerList, target: Type) -> nodes.Expression:
     if not isinstance(target, value_types.VectorType):
         if len(node.items) == 1:
-            return converted(scope, node.items[0], target)
+            return convert_value(scope, node.items[0], target)
         if not node.items:
             return nodes.Zero(target)
         raise SpecificationError.at(
@@ -45,7 +45,7 @@ def elements(scope: FunctionScope, node: tree.InitializerList, target: Type) -> 
             node.items[target.length].position,
             f"more than the {counted(target.length, 'element')} of the array",
         )
-    items = tuple(converted(scope, item, target.element) for item in node.items)
+    items = tuple(convert_value(scope, item, target.element) for item in node.items)
     return nodes.Vector(target, items, 0 if target.length is None else target.length - len(items))
 
 
@@ -111,12 +111,12 @@ def _unknown(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, 
         return SpecificationError(())
     advice = instead(parts)
     if advice is not None:
-        return SpecificationError.at(node.position, f"unknown function {shown(name)}; {advice}")
+        return SpecificationError.at(node.position, f"unknown function {quote(name)}; {advice}")
     owners = [other.name for other in scope.shared.specifications if parts[0] in other.functions]
     if owners and len(parts) == 1:
         return SpecificationError.at(
             node.position,
-            f"{shown(name)} is a function of {owners[0]}; functions belong to their specification",
+            f"{quote(name)} is a function of {owners[0]}; functions belong to their specification",
         )
     known = [
         *scope.names.functions,
@@ -129,7 +129,7 @@ def _unknown(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, 
     ]
     hint = nearest(parts[-1], known)
     return SpecificationError.at(
-        node.position, f"unknown function {shown(name)}{hint if 'mean' in hint else ''}"
+        node.position, f"unknown function {quote(name)}{hint if 'mean' in hint else ''}"
     )
 
 
@@ -150,7 +150,7 @@ def _helper(scope: FunctionScope, node: tree.CallExpression, function: HelperFun
     targets: list[Value] = []
     for argument, parameter, value in zip(node.arguments, function.parameters, values, strict=True):
         if parameter in function.references:
-            before, target = order.settled(scope, value)
+            before, target = order.settle(scope, value)
             first += before
             targets.append(target)
             handed.append(target.form)
@@ -235,7 +235,7 @@ def _macro(scope: FunctionScope, node: tree.CallExpression, macro: re.Match[str]
     if stream:
         if len(arguments) != 1:
             raise SpecificationError.at(node.position, f"`{macro[0]}` takes the values to print: `a << b`")
-        value = streamed(scope, node, level, arguments[0])
+        value = compile_stream(scope, node, level, arguments[0])
     else:
         value = _log(scope, node, level, tuple(arguments))
     if guard is None:
@@ -250,7 +250,7 @@ def _log(
     if not arguments:
         raise SpecificationError.at(node.position, "there is nothing to print; write a string")
     template, *rest = (scope.value_of(argument) for argument in arguments)
-    line = nodes.Log(level, formatted(scope, template, rest), scope.site(node))
+    line = nodes.Log(level, compile_format(scope, template, rest), scope.site(node))
     return Value(line, node.position)
 
 
@@ -271,7 +271,7 @@ def stream_of(node: tree.Expression) -> str | None:
     return {"cout": "INFO", "cerr": "ERROR", "clog": "INFO"}.get(node.parts[-1])
 
 
-def streamed(
+def compile_stream(
     scope: FunctionScope, node: tree.SyntaxNode, level: str, chain: tree.Expression, *, headed: bool = False
 ) -> Value:
     """Compile the output of `a << b << c`. If it is `headed`, the first operand is the stream itself."""
@@ -293,9 +293,9 @@ def _piece(scope: FunctionScope, stream: OutputStream, part: tree.Expression) ->
     if isinstance(part, tree.CallExpression) and isinstance(part.callee, tree.Name):
         name, arguments = part.callee.parts[-1], part.arguments
         if name == "setprecision" and len(arguments) == 1:
-            stream.manipulated(part.callee, scope.value_of(arguments[0]))
+            stream.apply_manipulator(part.callee, scope.value_of(arguments[0]))
             return None
-    return None if stream.manipulated(part, None) else stream.piece(scope.value_of(part))
+    return None if stream.apply_manipulator(part, None) else stream.piece(scope.value_of(part))
 
 
 # Constructors

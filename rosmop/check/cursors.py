@@ -6,7 +6,7 @@ A cursor is an index into a vector that is known at compile time; a variable can
 from collections.abc import Sequence
 
 from rosmop.check.assignables import Value
-from rosmop.check.assignments import mark, marked, require_place
+from rosmop.check.assignments import mark, require_place, with_mark
 from rosmop.check.conversion import convert, number
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
@@ -16,7 +16,7 @@ from rosmop.types import value_types
 ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 
 
-def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
+def move(operator: str, left: Value, right: Value, position: Position) -> Value | None:
     """Return the value of `begin + n`, `end - n` or `end - begin`, and None for other operations."""
     if left.vector is None or operator not in ("+", "-"):
         return None
@@ -42,7 +42,7 @@ def begin_or_end(base: Value, name: str, position: Position) -> Value:
 def erase(scope: FunctionScope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
     first, last = _index(base, cursors[0]), nodes.Literal(value_types.VOID, None)
     arguments = (base.form, first, _index(base, cursors[1]) if len(cursors) > 1 else last)
-    return _changed(scope, base, nodes.Call(value_types.VOID, "k_erase", arguments, at[1]), at[0])
+    return _change(scope, base, nodes.Call(value_types.VOID, "k_erase", arguments, at[1]), at[0])
 
 
 def insert(scope: FunctionScope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
@@ -50,7 +50,7 @@ def insert(scope: FunctionScope, base: Value, arguments: Sequence[Value], at: tu
     value = convert(scope, arguments[1], kind.element, at[1])
     width = nodes.Literal(value_types.ULONG, scope.values.width(kind.element))
     handed = (base.form, _index(base, arguments[0]), value, width)
-    return _changed(scope, base, nodes.Call(value_types.VOID, "k_insert", handed, at[1]), at[0])
+    return _change(scope, base, nodes.Call(value_types.VOID, "k_insert", handed, at[1]), at[0])
 
 
 def algorithm(scope: FunctionScope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
@@ -68,7 +68,7 @@ def algorithm(scope: FunctionScope, name: str, values: Sequence[Value], at: tupl
         )
     if name == "sort" and not value_types.is_scalar(kind.element):
         raise SpecificationError.at(position, f"a {kind} has no order to sort by")
-    return _changed(scope, base, nodes.Call(value_types.VOID, f"k_{name}", span, site), position)
+    return _change(scope, base, nodes.Call(value_types.VOID, f"k_{name}", span, site), position)
 
 
 def _sum(
@@ -101,6 +101,6 @@ def _index(base: Value, cursor: Value) -> nodes.Expression:
     return cursor.form
 
 
-def _changed(scope: FunctionScope, base: Value, change: nodes.Expression, position: Position) -> Value:
+def _change(scope: FunctionScope, base: Value, change: nodes.Expression, position: Position) -> Value:
     require_place(base, "this")
-    return Value(marked(mark(scope, base), change), position)
+    return Value(with_mark(mark(scope, base), change), position)

@@ -12,7 +12,7 @@ from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.pattern import ENFORCED, TimedPattern
 from rosmop.logics.property_lint import TIME, VerdictGraph, graph_of, shortest_trace_to
 from rosmop.text import tree
-from rosmop.types.messages import nearest, shown
+from rosmop.types.messages import nearest, quote
 
 _TAKES = {
     "pattern": "write `enforced by f` after `within`, with a function f that publishes the due message",
@@ -29,7 +29,7 @@ def blocking_refused(
         return refused
     for index, event in enumerate(specification.events):
         if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
-            return f"the timer {shown(event.name)} can make @{category} run, and it has no message to drop"
+            return f"the timer {quote(event.name)} can make @{category} run, and it has no message to drop"
     return None
 
 
@@ -118,12 +118,12 @@ def remedy_code(
     if function is None:
         if name in names.misdeclared:
             raise SpecificationError(())
-        raise SpecificationError.at(place, f"unknown function {shown(name)}{nearest(name, names.functions)}")
+        raise SpecificationError.at(place, f"unknown function {quote(name)}{nearest(name, names.functions)}")
     if function.parameters:
-        raise SpecificationError.at(place, f"{shown(name)} takes parameters; at a deadline there are none")
+        raise SpecificationError.at(place, f"{quote(name)} takes parameters; at a deadline there are none")
     topics = topics_of(names, name)
     if not topics:
-        raise SpecificationError.at(place, f"{shown(name)} publishes nothing; write `PUBLISH(…)` in it")
+        raise SpecificationError.at(place, f"{quote(name)} publishes nothing; write `PUBLISH(…)` in it")
     awaited = compiled.events[compiled.pattern.second]
     number, event = next(
         (number, one) for number, one in enumerate(specification.events) if one.name == awaited
@@ -131,10 +131,10 @@ def remedy_code(
     trigger = event.trigger
     if not isinstance(trigger, tree.MessageTrigger) or trigger.part is not None:
         what = "a timer" if isinstance(trigger, tree.TimerTrigger) else "an event of a service"
-        text = f"{shown(awaited)} is {what}, so no message that {shown(name)} publishes is the due one"
+        text = f"{quote(awaited)} is {what}, so no message that {quote(name)} publishes is the due one"
         raise SpecificationError.at(place, f"{text}; await an event on a topic")
     if trigger.topic not in topics:
-        text = f"{shown(name)} publishes {', '.join(topics)}, but the due message {shown(awaited)} is on"
+        text = f"{quote(name)} publishes {', '.join(topics)}, but the due message {quote(awaited)} is on"
         raise SpecificationError.at(place, f"{text} {trigger.topic}; publish it there")
     at = node.position
     call = tree.ExpressionStatement(at, tree.CallExpression(at, tree.Name(at, (name,)), ()))

@@ -15,7 +15,7 @@ from rosmop.form import nodes
 from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import nearest, shown
+from rosmop.types.messages import nearest, quote
 
 SENDER = ("host", "caller")
 ALTERED, TOPIC = "altered", "topic"
@@ -114,7 +114,7 @@ def _event(scope: FunctionScope, node: tree.CallExpression, function: str) -> st
     where = node.arguments[0].position if len(node.arguments) == 1 else node.position
     hint = nearest(name, scope.names.events) if name else ""
     text = f"`{function}` takes the name of an event with a message"
-    raise SpecificationError.at(where, f"{text}; {shown(name)} is not one{hint}" if name else text)
+    raise SpecificationError.at(where, f"{text}; {quote(name)} is not one{hint}" if name else text)
 
 
 def _asked(specification: tree.Specification) -> Iterator[tuple[str, str]]:

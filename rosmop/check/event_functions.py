@@ -22,7 +22,7 @@ from rosmop.form.sites import Site
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import UnknownNameError, nearest, shown
+from rosmop.types.messages import UnknownNameError, nearest, quote
 from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type
 from roswire.errors import DefinitionError
@@ -155,7 +155,7 @@ def _message_type(shared: CompilationContext, trigger: tree.MessageTrigger) -> s
             known = shared.messages.definitions.service_types
             raise SpecificationError.at(
                 trigger.type_position,
-                f"unknown service type {shown(kind)}{nearest(kind, known)}; others need a .srv file (--msg DIR)",
+                f"unknown service type {quote(kind)}{nearest(kind, known)}; others need a .srv file (--msg DIR)",
             ) from None
         kind = (service.request if trigger.part == "request" else service.response).name
     try:
@@ -175,7 +175,7 @@ def _bind(
     for parameter in event.parameters:
         if parameter.name in parameters:
             raise SpecificationError.at(
-                parameter.position, f"the parameter {shown(parameter.name)} occurs twice"
+                parameter.position, f"the parameter {quote(parameter.name)} occurs twice"
             )
         parameters[parameter.name] = parameter
     bound = []
@@ -197,7 +197,7 @@ def _bind(
         if parameter.name not in named:
             raise SpecificationError.at(
                 parameter.position,
-                f"the parameter {shown(parameter.name)} is not bound to a field; write `field:{parameter.name}`",
+                f"the parameter {quote(parameter.name)} is not bound to a field; write `field:{parameter.name}`",
             )
     return bound
 
@@ -210,7 +210,7 @@ def _binds_nothing(
     if name in parameters or name in scope.names.parameters:
         return False
     type_of_path(scope.messages, kind, binding.path)
-    text = f"{shown(name)} is not a parameter of the event, so it binds nothing; leave it out"
+    text = f"{quote(name)} is not a parameter of the event, so it binds nothing; leave it out"
     scope.shared.findings.append(Diagnostic(binding.value_position, "warning", text))
     return True
 
@@ -226,7 +226,7 @@ def _bind_one(
     if parameter is None:
         raise SpecificationError.at(
             binding.value_position,
-            f"unknown parameter {shown(binding.variable)}{nearest(binding.variable, parameters)}",
+            f"unknown parameter {quote(binding.variable)}{nearest(binding.variable, parameters)}",
         )
     target = field if parameter.type.name == ("auto",) else resolve(parameter.type, scope.messages)
     if not value_types.convertible(field, target):
@@ -240,7 +240,7 @@ def _bind_one(
     sliced = scope.names.parameters.get(parameter.name)
     if sliced is not None and sliced.type != target:
         text = (
-            f"the parameter {shown(parameter.name)} of the specification is {sliced.type}, and {target} here"
+            f"the parameter {quote(parameter.name)} of the specification is {sliced.type}, and {target} here"
         )
         raise SpecificationError.at(parameter.position, text)
     variable = Variable(parameter.name, target, scope.symbols.fresh("v"), parameter.position)

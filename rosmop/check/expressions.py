@@ -28,7 +28,7 @@ from rosmop.runtime.action_context import FaultError
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 from rosmop.types.resolve import resolve
 
 # Note how close comparisons of numbers came: both sides when they were nearest, while true and while false.
@@ -43,7 +43,7 @@ _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
 
 
-def noted(
+def note_comparison(
     scope: FunctionScope, node: tree.BinaryExpression, left: Value, right: Value, value: Value
 ) -> Value:
     compare = value.form
@@ -102,12 +102,12 @@ def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
 def literal_number(scope: FunctionScope, node: tree.NumberLiteral) -> Value:
     found = _NUMBER.match(node.text)
     if found is None or len(node.text) > _MAX_DIGITS or found[1].count(".") > 1:
-        raise SpecificationError.at(node.position, f"{shown(node.text)} is not a number")
+        raise SpecificationError.at(node.position, f"{quote(node.text)} is not a number")
     text, suffix = found[1], found[2].lower()
     if not text.lower().startswith("0x") and re.search(r"[.eE]", text):
         return _floating(node, float(text), suffix)
     if "f" in suffix:
-        raise SpecificationError.at(node.position, f"{shown(node.text)} is not a number; write `{text}.0f`")
+        raise SpecificationError.at(node.position, f"{quote(node.text)} is not a number; write `{text}.0f`")
     return _integer(scope, node, text, suffix)
 
 
@@ -117,7 +117,7 @@ def _is_beyond_long(node: tree.NumberLiteral) -> bool:
 
 def _floating(node: tree.NumberLiteral, value: float, suffix: str) -> Value:
     if suffix not in ("", "f", "l"):
-        raise SpecificationError.at(node.position, f"{shown(node.text)} is not a number")
+        raise SpecificationError.at(node.position, f"{quote(node.text)} is not a number")
     if suffix == "f":
         return constant_value(node.position, value_types.FLOAT, f32(value))
     return constant_value(node.position, value_types.DOUBLE, value)
@@ -129,7 +129,7 @@ def _integer(scope: FunctionScope, node: tree.NumberLiteral, text: str, suffix: 
         value = int(text, 10 if decimal else 16 if text[1:2] in ("x", "X") else 8)
     except ValueError:
         raise SpecificationError.at(
-            node.position, f"{shown(node.text)} is not a number; one that begins with 0 is octal"
+            node.position, f"{quote(node.text)} is not a number; one that begins with 0 is octal"
         ) from None
     candidates: list[value_types.IntegerType] = [
         value_types.INT,
@@ -147,14 +147,14 @@ def _integer(scope: FunctionScope, node: tree.NumberLiteral, text: str, suffix: 
             return constant_value(node.position, kind, value)
     if value <= value_types.ULONG.most:  # g++ uses a 128-bit type for this value, and also warns
         warning = (
-            f"{shown(node.text)} is larger than `long` holds, and an `unsigned long` here; write `{text}u`"
+            f"{quote(node.text)} is larger than `long` holds, and an `unsigned long` here; write `{text}u`"
         )
         scope.shared.findings.append(Diagnostic(node.position, "warning", warning))
         return constant_value(node.position, value_types.ULONG, value)
-    raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
+    raise SpecificationError.at(node.position, f"{quote(node.text)} is larger than any integer type holds")
 
 
-def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
+def fold(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
     if not all(isinstance(operand.constant, int | float) for operand in operands):
         return make(*operands)
     known = [
@@ -197,11 +197,11 @@ def _name(scope: FunctionScope, node: tree.Name) -> Value:
     if len(parts) == 3:
         return members.constant(scope, "/".join(parts[:2]), parts[2], node.position)
     if len(parts) == 1 and parts[0] in scope.names.functions:
-        raise SpecificationError.at(node.position, f"{shown(parts[0])} is a function; write `{parts[0]}(…)`")
+        raise SpecificationError.at(node.position, f"{quote(parts[0])} is a function; write `{parts[0]}(…)`")
     name = "::".join(parts)
     if parts[-1] in ("cout", "cerr", "endl"):
         raise SpecificationError.at(
-            node.position, f"{shown(name)} is only allowed at the start of a statement, or after `<<`"
+            node.position, f"{quote(name)} is only allowed at the start of a statement, or after `<<`"
         )
     raise scope.unknown(name, node.position)
 
@@ -243,10 +243,10 @@ def _unary(scope: FunctionScope, node: tree.UnaryExpression) -> Value:
         if int(node.operand.text) == -value_types.LONG.least:
             return constant_value(node.position, value_types.LONG, value_types.LONG.least)
         raise SpecificationError.at(
-            node.position, f"{shown('-' + node.operand.text)} is less than any integer type holds"
+            node.position, f"{quote('-' + node.operand.text)} is less than any integer type holds"
         )
     site = scope.site(node)
-    return folded(
+    return fold(
         (value_of(scope, node.operand),),
         lambda operand: operators.unary(node.operator, operand, node.position, site),
     )
@@ -255,7 +255,7 @@ def _unary(scope: FunctionScope, node: tree.UnaryExpression) -> Value:
 def _step(scope: FunctionScope, node: tree.IncrementExpression) -> Value:
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
-    first, target = ([], target) if target.pure else order.settled(scope, target)
+    first, target = ([], target) if target.pure else order.settle(scope, target)
     one = constant_value(node.position, value_types.INT, 1)
     operands = operators.Operands(scope, node.position, target, one, scope.site(node))
     changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
@@ -272,13 +272,13 @@ def _binary(scope: FunctionScope, node: tree.BinaryExpression) -> Value:
         truth = "always true" if node.operator == "!=" else "never true"
         text = f"`{node.operator}` with NaN is {truth}; to find NaN write `std::isnan(…)`"
         scope.shared.findings.append(Diagnostic(node.position, "warning", text))
-    value = folded(
+    value = fold(
         operands,
         lambda left, right: operators.binary(
             node.operator, operators.Operands(scope, node.position, left, right, site)
         ),
     )
-    return noted(scope, node, *operands, value)
+    return note_comparison(scope, node, *operands, value)
 
 
 def _assign(scope: FunctionScope, node: tree.Assignment) -> Value:
@@ -307,7 +307,7 @@ def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First
         return first, target, _assigned(scope, target, value, site)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
     if node.operator == "+=" and isinstance(target.type, value_types.StringType):
-        return first, target, operators.extended(operands).form
+        return first, target, operators.extend(operands).form
     return first, target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
 
 
@@ -320,7 +320,7 @@ def _assigned(scope: FunctionScope, target: Value, value: Value, site: int) -> n
 
 def _conditional(scope: FunctionScope, node: tree.ConditionalExpression) -> Value:
     values = tuple(value_of(scope, part) for part in (node.condition, node.yes, node.no))
-    return folded(values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
+    return fold(values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
 
 
 def _either(scope: FunctionScope, position: Position, tested: Value, yes: Value, no: Value) -> Value:
@@ -368,7 +368,7 @@ def _member(scope: FunctionScope, node: tree.MemberAccess) -> Value:
 
 def _cast(scope: FunctionScope, node: tree.CastExpression) -> Value:
     target = resolve(node.type, scope.messages)
-    return folded(
+    return fold(
         (value_of(scope, node.operand),), lambda value: Value(convert(scope, value, target), node.position)
     )
 

@@ -33,10 +33,10 @@ from rosmop.check.abstract_values import (
     PathState,
     Places,
     is_tainted,
-    joined,
+    join,
     key_of,
-    merged,
-    negated,
+    merge,
+    negate,
     of_compared,
     of_number,
     shared_of,
@@ -100,7 +100,7 @@ class FlowAnalysis:
     def event(self, function: nodes.Function, state: PathState) -> Exits:
         exits = self._block(function.body, state)
         return {
-            Exit("leave", way.fate, way.happened): merged(
+            Exit("leave", way.fate, way.happened): merge(
                 one
                 for other, one in exits.items()
                 if (other.fate, other.happened) == (way.fate, way.happened)
@@ -187,12 +187,12 @@ class FlowAnalysis:
         return {Exit("leave", state.fate, node.happened is not False): state}
 
     def _drop(self, node: nodes.Drop, state: PathState) -> Exits:
-        return self._suppressed(node, state, DROPPED)
+        return self._suppress(node, state, DROPPED)
 
     def _stop(self, node: nodes.StopMessage, state: PathState) -> Exits:
         if any(safe.topic == self._topic for safe in node.safes):
-            return self._suppressed(node, state, REPLACED)
-        return self._suppressed(node, state, SENT if state.fate == LIVE else state.fate)
+            return self._suppress(node, state, REPLACED)
+        return self._suppress(node, state, SENT if state.fate == LIVE else state.fate)
 
     def _publish(self, node: nodes.Publish, state: PathState) -> Exits:
         self.published.append(self.value(node.value, state))
@@ -213,7 +213,7 @@ class FlowAnalysis:
             return self._next(node, state)
         return {Exit("leave", state.fate): state}
 
-    def _suppressed(self, node: nodes.Drop | nodes.StopMessage, state: PathState, fate: str) -> Exits:
+    def _suppress(self, node: nodes.Drop | nodes.StopMessage, state: PathState, fate: str) -> Exits:
         self.drops[node.site] = self.drops.get(node.site, EMPTY) | state.inputs
         state.fate = fate
         return {Exit("next", fate): state}
@@ -225,7 +225,7 @@ class FlowAnalysis:
         for truth, taken, other in ((True, node.yes, node.no), (False, node.no, node.yes)):
             if test.known is not UNKNOWN and bool(test.known) is not truth:
                 continue
-            inner = state.branched()
+            inner = state.branch()
             ends = taken and isinstance(taken[-1], nodes.Break | nodes.Continue | nodes.Return | nodes.Leave)
             untaken = self._work.others.setdefault((id(node), truth), (*other, *rest) if ends else other)
             facts = self._work.facts_of(untaken)
@@ -302,8 +302,8 @@ class FlowAnalysis:
             exits = Exits()
             for fate, head in [*heads.items()]:
                 if ends:
-                    _add(exits, Exit("next", fate), head.branched())
-                for way, after in body(head.branched()).items():
+                    _add(exits, Exit("next", fate), head.branch())
+                for way, after in body(head.branch()).items():
                     if way.how in ("next", "continue"):
                         _add(heads, way.fate, after)
                     else:
@@ -319,7 +319,7 @@ class FlowAnalysis:
         test = self.value(node.test, state)
         exits: Exits = {}
         if test.known is UNKNOWN or not test.known:
-            out = state.branched()
+            out = state.branch()
             if self.restricts:
                 out.skipped |= test.why if test.known is not UNKNOWN else test.less_true
             exits[Exit("leave", state.fate, happened=False)] = out
@@ -439,7 +439,7 @@ class FlowAnalysis:
     def _logical(self, node: nodes.Logical, state: PathState) -> AbstractValue:
         left = self.value(node.left, state)
         decisive = node.operator == "or"
-        aside = state.branched()
+        aside = state.branch()
         _assume(node.left, aside, truth=not decisive)
         right = self.value(node.right, aside)
         inputs = left.inputs | right.inputs
@@ -456,13 +456,13 @@ class FlowAnalysis:
         return AbstractValue(less_true=true, less_false=false, inputs=inputs)
 
     def _not(self, node: nodes.Not, state: PathState) -> AbstractValue:
-        return negated(self.value(node.value, state))
+        return negate(self.value(node.value, state))
 
     def _conditional(self, node: nodes.Conditional, state: PathState) -> AbstractValue:
         test = self.value(node.test, state)
         sides = []
         for truth, side in ((True, node.yes), (False, node.no)):
-            aside = state.branched()
+            aside = state.branch()
             _assume(node.test, aside, truth=truth)
             sides.append(self.value(side, aside))
         yes, no = sides
@@ -473,8 +473,8 @@ class FlowAnalysis:
             why = taken.why | test.why if kept else taken.why
             return taken._replace(why=why, inputs=inputs)
         if isinstance(yes.known, bool) and isinstance(no.known, bool) and yes.known is not no.known:
-            return (test if yes.known else negated(test))._replace(inputs=inputs)
-        both = joined(yes, no)
+            return (test if yes.known else negate(test))._replace(inputs=inputs)
+        both = join(yes, no)
         if both.may_be_nan:
             both = both._replace(why=both.why | test.less_true | test.less_false)
         return both._replace(inputs=inputs)
@@ -600,7 +600,7 @@ class FlowAnalysis:
         before = self._read(name, state)
         box = before.known if isinstance(before.known, AbstractParts) else AbstractParts()
         if node.function == "l_append" and (old := box.parts.get(path)) is not None:
-            value = joined(old, value)
+            value = join(old, value)
         if state.control and (value.is_number or value.known is UNKNOWN):
             value = value._replace(why=value.why | state.control)
         inputs = before.inputs | value.inputs | state.inputs
@@ -666,7 +666,7 @@ class FlowAnalysis:
         """Follow a call; a function without effects is followed once for each set of values that it reads."""
         facts = self._work.facts_of_function(function, self._functions)
         if not facts.pure:
-            return self._followed(function, arguments, inputs, state)
+            return self._follow(function, arguments, inputs, state)
         read = {name: state.values[name] for name in facts.shared if name in state.values}
         source = self._source if self._source in facts.sites else None
         key = (
@@ -678,7 +678,7 @@ class FlowAnalysis:
             before = self.compared, self.operations
             self.compared, self.operations = set(), set()
             inner = PathState(read, control=state.control, inputs=state.inputs)
-            result = self._followed(function, arguments, inputs, inner)
+            result = self._follow(function, arguments, inputs, inner)
             call = PureCall(
                 result, inner.skipped, inner.spoke, frozenset(self.compared), frozenset(self.operations)
             )
@@ -690,7 +690,7 @@ class FlowAnalysis:
         state.spoke = state.spoke or call.spoke
         return call.result
 
-    def _followed(
+    def _follow(
         self,
         function: nodes.Function,
         arguments: Sequence[AbstractValue],
@@ -698,7 +698,7 @@ class FlowAnalysis:
         state: PathState,
     ) -> AbstractValue:
         site = self._site
-        inner = state.branched()
+        inner = state.branch()
         for name, value in zip(function.parameters, arguments, strict=False):
             inner.values[name] = value
         self._depth += 1
@@ -707,7 +707,7 @@ class FlowAnalysis:
         self._site = site
         if not exits:
             return AbstractValue(inputs=inputs)
-        after = merged(exits.values())
+        after = merge(exits.values())
         for name, value in after.values.items():
             state.values[name] = value
         state.skipped |= after.skipped
@@ -815,4 +815,4 @@ _Key = TypeVar("_Key")
 
 def _add(states: dict[_Key, PathState], key: _Key, state: PathState) -> None:
     known = states.get(key)
-    states[key] = state if known is None else merged((known, state))
+    states[key] = state if known is None else merge((known, state))

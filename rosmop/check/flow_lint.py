@@ -32,7 +32,7 @@ from rosmop.check.abstract_values import (
     is_shared,
     is_tainted,
     key_of,
-    merged,
+    merge,
 )
 from rosmop.check.enforcement import bringing
 from rosmop.check.flow import Exits, FlowAnalysis
@@ -44,7 +44,7 @@ from rosmop.form.compiled import EventCode, PropertyCode, SpecificationCode
 from rosmop.form.findings import Diagnostic
 from rosmop.logics.property_lint import graph_of
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 from rosmop.types.value_types import Type
 
 _MAX_LEAVES = 32
@@ -82,13 +82,13 @@ class _Event:
     def channel(self) -> str | None:
         return self.code.channel
 
-    def passed(self) -> list[PathState]:
+    def passed_states(self) -> list[PathState]:
         return [state for way, state in self.exits.items() if way.fate in PASSES]
 
-    def suppressed(self) -> list[PathState]:
+    def suppressed_states(self) -> list[PathState]:
         return [state for way, state in self.exits.items() if way.fate not in PASSES]
 
-    def sent(self) -> list[PathState]:
+    def sent_states(self) -> list[PathState]:
         return [state for way, state in self.exits.items() if way.fate == SENT]
 
 
@@ -201,7 +201,7 @@ class SpecificationFlow:
                 yield Diagnostic(position, "warning", text)
 
     def _sources(self) -> Iterator[tuple[_Source, dict[str, AbstractValue]]]:
-        reached = self._reached()
+        reached = self._reached_inputs()
         known = set[tuple[str | None, str]]()
         for event in self.events:
             for one in event.bound:
@@ -219,7 +219,7 @@ class SpecificationFlow:
             if value.is_nan and variable in reached:
                 yield _Source(self._variables.get(variable, "")), {variable: AbstractValue(NAN)}
 
-    def _reached(self) -> set[str]:
+    def _reached_inputs(self) -> set[str]:
         """Return the inputs that come to a comparison, a bound or a conversion, perhaps by way of variables."""
         found = {name for event in self.events for name in event.compared}
         stored: dict[str, frozenset[str]] = {}
@@ -241,12 +241,12 @@ class SpecificationFlow:
         delta = start
         if not start:
             events = [event for event in self.events if event.channel == source.channel]
-            found, after = self._judged(events, source, {})
+            found, after = self._judge(events, source, {})
             if found and source.path and not self._bounds(events, source):
                 found = frozenset()
             if source.site is not None:
                 found = frozenset(place for place in found if place[0] != TEST)
-            delta = _tainted(after)
+            delta = _tainted_variables(after)
         fresh = {name for name, value in delta.items() if is_tainted(value)}
         for _ in range(_ROUNDS):
             grown = dict(delta)
@@ -268,14 +268,14 @@ class SpecificationFlow:
         read = {name: value for name, value in delta.items() if name in batch.shared}
         key = (batch.number, frozenset((name, key_of(value)) for name, value in read.items()))
         if key not in self._followed:
-            self._followed[key] = self._judged(batch.events, None, read)
+            self._followed[key] = self._judge(batch.events, None, read)
         return self._followed[key]
 
     def _batch(self, number: int, events: Sequence[_Event]) -> _Batch:
         facts = (self._work.facts_of_function(event.function, self._forms) for event in events)
         return _Batch(number, events, frozenset[str]().union(*(fact.shared for fact in facts)))
 
-    def _judged(
+    def _judge(
         self, events: Sequence[_Event], source: _Source | None, values: Mapping[str, AbstractValue]
     ) -> tuple[Places, dict[str, AbstractValue]]:
         """Run the events of a channel one after the other; return the places, and the variables afterwards."""
@@ -287,7 +287,7 @@ class SpecificationFlow:
             own = self._give(flow, event, source, value) if source is not None else ""
             ends = [end for state in live for end in flow.event(event.function, state).items()]
             live = [after for way, after in ends if way.fate in PASSES]
-            written = [one for after in live for one in _written(event, after)]
+            written = [one for after in live for one in _written_fields(event, after)]
             found = found.union(*(map(_badly, [*(one for _, one in written), *flow.published])))
             replaced = [one for variable, one in written if variable == own]
             if live and len(replaced) == len(live) and not any(map(_has_nan, replaced)):
@@ -295,9 +295,9 @@ class SpecificationFlow:
                 for after in live:
                     after.skipped = frozenset()
             by_fate = ([after for after in live if after.fate == fate] for fate in PASSES)
-            live = [merged(each) for each in by_fate if each]
+            live = [merge(each) for each in by_fate if each]
         found = found.union(*(state.skipped for state in live if state.fate == LIVE))
-        left = merged(live).values if live else {}  # where a message is stopped, so is what follows from it
+        left = merge(live).values if live else {}  # where a message is stopped, so is what follows from it
         return found, {name: one for name, one in left.items() if is_shared(name)}
 
     def _give(self, flow: FlowAnalysis, event: _Event, source: _Source, value: AbstractValue) -> str:
@@ -317,7 +317,7 @@ class SpecificationFlow:
             flow = self._flow(event)
             self._give(flow, event, source, AbstractValue(number))
             for way, state in flow.event(event.function, PathState()).items():
-                sent = _written(event, state) if abs(number) > 1 else ()
+                sent = _written_fields(event, state) if abs(number) > 1 else ()
                 if way.fate != LIVE or not way.happened or any(value.known != number for _, value in sent):
                     return True
         return any(
@@ -327,12 +327,12 @@ class SpecificationFlow:
     # Returns
 
     def _returns(self, event: _Event) -> Iterator[Diagnostic]:
-        passed, suppressed = event.passed(), event.suppressed()
+        passed, suppressed = event.passed_states(), event.suppressed_states()
         decides = any(isinstance(node, nodes.If | nodes.Select) for node in nodes.walk(event.function.body))
         happened = [state for way, state in event.exits.items() if way.fate in PASSES and way.happened]
         dropped = all(way.fate == DROPPED for way in event.exits if way.fate not in PASSES)
         if suppressed and not happened and decides and dropped and not _drops_by_word(event.function):
-            text = f"{shown(event.code.name)} drops every message, because each path ends with `return;`, which drops"
+            text = f"{quote(event.code.name)} drops every message, because each path ends with `return;`, which drops"
             advice = "it; leave out the `return;` of the path that passes"
             yield Diagnostic(event.code.position, "warning", f"{text} {advice}")
         kept = frozenset[int]().union(*(state.written for state in passed))
@@ -348,7 +348,7 @@ class SpecificationFlow:
                 name = next(
                     (flags[flag] for flag in self._flags_at(event.function, site) if flag in flags), ""
                 )
-                text = f"the new value of {shown(name)} is lost, because this path {how} the message"
+                text = f"the new value of {quote(name)} is lost, because this path {how} the message"
                 yield Diagnostic(
                     self._sites[site].position,
                     "warning",
@@ -383,8 +383,8 @@ class SpecificationFlow:
             site = min(event.drops, default=None)
             name = self._variables.get(min(updated), "")
             if site is not None and name:
-                text = f"this `return;` drops the message and leaves {shown(name)} as it was, so other topics are"
-                text += f" judged by an older message; set {shown(name)} before, or let the message pass"
+                text = f"this `return;` drops the message and leaves {quote(name)} as it was, so other topics are"
+                text += f" judged by an older message; set {quote(name)} before, or let the message pass"
                 yield Diagnostic(self._sites[site].position, "warning", text)
 
     def _decides(self, event: _Event) -> frozenset[str]:
@@ -448,7 +448,7 @@ class SpecificationFlow:
             for name in sorted(deciding & self._variables.keys() - elsewhere):
                 remembered = any(
                     name in state.values and not numbers.isdisjoint(state.values[name].inputs)
-                    for state in event.passed()
+                    for state in event.passed_states()
                 )
                 if remembered:
                     yield event, name
@@ -458,7 +458,7 @@ class SpecificationFlow:
         for event, name in self.limits():
             who = next(self._forgetful(event, name), "")
             if who:
-                what = shown(self._variables[name])
+                what = quote(self._variables[name])
                 text = f"{what} remembers a command by which later ones are limited, but {who} may stop or drop that"
                 text += (
                     f" command: the next one is limited as if the robot had driven on; also set {what} there"
@@ -468,9 +468,9 @@ class SpecificationFlow:
     def _forgetful(self, event: _Event, name: str) -> Iterator[str]:
         """Yield what may stop or drop a command that the variable remembers, without a change of the variable."""
         for other in self.events[self.events.index(event) + 1 :]:
-            stopped = other.suppressed() if other.channel == event.channel else []
+            stopped = other.suppressed_states() if other.channel == event.channel else []
             if any(name not in state.values for state in stopped):
-                yield shown(other.code.name)
+                yield quote(other.code.name)
         for code in self.code.properties:
             handlers = (self._forms[handler] for handler in code.handlers.values())
             if any(_suppresses(handler) and name not in handler.shared for handler in handlers):
@@ -480,14 +480,14 @@ class SpecificationFlow:
         """Whether it may stop or drop messages of a topic."""
         events = [event for event in self.events if event.code.topic == topic and event.code.part is None]
         stops = any(safe.topic == topic for safe in self.code.safes) and any(
-            event.sent() for event in self.events
+            event.sent_states() for event in self.events
         )
         handlers = [self._forms[name] for code in self.code.properties for name in code.handlers.values()]
         handled = bool(events) and any(map(_suppresses, handlers))
-        return stops or handled or any(event.suppressed() for event in events)
+        return stops or handled or any(event.suppressed_states() for event in events)
 
-    def named(self, variable: str) -> str:
-        return shown(self._variables[variable])
+    def name_of(self, variable: str) -> str:
+        return quote(self._variables[variable])
 
 
 def flow_findings(shared: CompilationContext, compiled: Sequence[SpecificationCode]) -> list[Diagnostic]:
@@ -525,7 +525,7 @@ def _limits_before_stops(flows: Sequence[SpecificationFlow]) -> Iterator[Diagnos
                 if stop in seen or not later.may_suppress(event.code.topic or ""):
                     continue
                 seen.add(stop)
-                text = f"{flow.code.name} limits commands by the last one ({flow.named(name)}), and {stop}, which may"
+                text = f"{flow.code.name} limits commands by the last one ({flow.name_of(name)}), and {stop}, which may"
                 text += " stop or drop it, comes later: then the robot jumps, as if it had driven on; write"
                 yield Diagnostic(event.code.position, "warning", f"{text} `order {stop} < {flow.code.name};`")
 
@@ -554,7 +554,7 @@ def _channel(event: _Event) -> str:
     return event.channel or ""
 
 
-def _written(event: _Event, state: PathState) -> list[tuple[str, AbstractValue]]:
+def _written_fields(event: _Event, state: PathState) -> list[tuple[str, AbstractValue]]:
     """Return the variables of fields that may have been assigned, and their values."""
     return [
         (variable, state.values.get(variable, AbstractValue()))
@@ -598,19 +598,19 @@ def _badly(value: AbstractValue) -> Places:
     return least if value.is_number and value.known != 0 else frozenset()
 
 
-def _tainted(values: Mapping[str, AbstractValue]) -> dict[str, AbstractValue]:
+def _tainted_variables(values: Mapping[str, AbstractValue]) -> dict[str, AbstractValue]:
     """Return the variables in which NaN has left a trace, with the numbers that are known beside them, or nothing."""
     kept = {name: value for name, value in values.items() if value.is_number or is_tainted(value)}
     return kept if any(map(is_tainted, kept.values())) else {}
 
 
 def _text(kind: str, name: str) -> str:
-    of, what = (f" of {shown(name)}", f"NaN in {shown(name)}") if name else ("", "NaN (of 0 / 0 or a root)")
+    of, what = (f" of {quote(name)}", f"NaN in {quote(name)}") if name else ("", "NaN (of 0 / 0 or a root)")
     if kind == COMPARISON:
         text = f"NaN passes this bound{of}, because each comparison with NaN is false; use `clamp`,"
         return f"{text} negate the opposite comparison (`!(x <= 1)`), or use `isnan`"
     if kind in _MIN_MAX:
-        where = f" in {shown(name)}" if name else ""
+        where = f" in {quote(name)}" if name else ""
         return f"`{kind}` passes NaN{where} on, or takes it for the other bound; test it with `isnan` before"
     if kind == TEST:
         return f"{what} passes, because this test lets it pass; negate the opposite (`!(x <= 1)`), or stop it"

@@ -10,12 +10,12 @@ from rosmop.check.function_library import ELEMENTARY, FREE
 from rosmop.check.loops import charge
 from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction, SpecificationNames
 from rosmop.check.slicing import check_own
-from rosmop.check.statements import initial, known, table, write
+from rosmop.check.statements import initial, literal_constant, table, write
 from rosmop.form import nodes
 from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 from rosmop.types.resolve import resolve
 
 _T = TypeVar("_T")
@@ -44,7 +44,7 @@ def _shared_variable(
     declarator: tree.Declarator,
 ) -> Variable:
     if declarator.name in names.variables or declarator.name in _TAKEN:
-        raise SpecificationError.at(declarator.position, f"{shown(declarator.name)} is declared twice")
+        raise SpecificationError.at(declarator.position, f"{quote(declarator.name)} is declared twice")
     scope = FunctionScope(shared, names, "init")
     scope.lines.site = scope.site(declaration)
     automatic = declaration.type.name == ("auto",)
@@ -66,7 +66,7 @@ def _shared_variable(
         declarator.position,
         shared=True,
         constant=declaration.type.constant,
-        known=_known(scope, declaration, declarator, kind, known),
+        known=_known(scope, declaration, declarator, kind, literal_constant),
         table=_known(scope, declaration, declarator, kind, table),
         sliced=bool(names.parameters) and not (declaration.type.static or declaration.type.constant),
     )
@@ -184,7 +184,7 @@ def declare_functions(
             names.misdeclared.add(node.name)
     called = _calls(names)
     for name, function in names.functions.items():
-        reached = _reached(called[name], called)
+        reached = _reachable(called[name], called)
         function.recursive = name in reached
         if function.references:
             function.names = frozenset().union(
@@ -194,11 +194,11 @@ def declare_functions(
 
 def _calls(names: SpecificationNames) -> dict[str, set[str]]:
     known = names.functions
-    return {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
+    return {name: {*_called_names(function.node.body)} & known.keys() for name, function in known.items()}
 
 
 def topics_of(names: SpecificationNames, function: str) -> list[str]:
-    reached = _reached({function}, _calls(names))
+    reached = _reachable({function}, _calls(names))
     found = (node for name in reached for node in tree.walk(names.functions[name].node.body))
     return sorted({node.topic for node in found if isinstance(node, tree.PublishStatement)})
 
@@ -207,7 +207,7 @@ def _signature(
     shared: CompilationContext, names: SpecificationNames, node: tree.FunctionDefinition
 ) -> HelperFunction:
     if node.name in names.functions or node.name in _TAKEN:
-        raise SpecificationError.at(node.position, f"the function {shown(node.name)} is declared twice")
+        raise SpecificationError.at(node.position, f"the function {quote(node.name)} is declared twice")
     result = value_types.VOID if node.type is None else resolve(node.type, shared.messages)
     parameters = []
     references = []
@@ -230,7 +230,7 @@ def _signature(
     )
 
 
-def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
+def _reachable(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
     seen = set(first)
     waiting = list(first)
     while waiting:
@@ -240,7 +240,7 @@ def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
     return seen
 
 
-def _called(node: tree.SyntaxNode) -> Iterable[str]:
+def _called_names(node: tree.SyntaxNode) -> Iterable[str]:
     for inner in tree.walk(node):
         if isinstance(inner, tree.CallExpression) and isinstance(inner.callee, tree.Name):
             yield inner.callee.parts[-1]

@@ -17,7 +17,7 @@ from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 from rosmop.types.resolve import resolve
 
 Topics = Mapping[str, Mapping[str, str]]
@@ -45,18 +45,18 @@ def _given(shared: CompilationContext, names: SpecificationNames, node: tree.Giv
     kind = resolve(tree.TypeName(node.position, node.type), shared.messages)
     code = shared.symbols.fresh("g")
     if node.name in names.variables:
-        raise SpecificationError.at(node.position, f"{shown(node.name)} is declared twice")
+        raise SpecificationError.at(node.position, f"{quote(node.name)} is declared twice")
     if isinstance(kind, value_types.BoolType):
         if node.bounds is not None or node.unit or node.default not in ("true", "false"):
             raise SpecificationError.at(node.position, f"write `bool {node.name} = true;` or `false`")
         return Given(node.name, code, kind, "", node.default == "true", None)
     if node.bounds is None or node.default in ("true", "false"):
-        text = f"{shown(node.name)} needs a range; write for example `{node.name} = 1 in 0..2`"
+        text = f"{quote(node.name)} needs a range; write for example `{node.name} = 1 in 0..2`"
         raise SpecificationError.at(node.position, text)
     default, least, most = (_number(kind, text, node.position) for text in (node.default, *node.bounds))
     given = Given(node.name, code, kind, node.unit, default, (least, most))
     if not given.holds(default):
-        text = f"the default {node.default} of {shown(node.name)} is outside of its range"
+        text = f"the default {node.default} of {quote(node.name)} is outside of its range"
         raise SpecificationError.at(node.position, f"{text} {node.bounds[0]}..{node.bounds[1]}")
     return given
 
@@ -113,7 +113,7 @@ def given_topics(
             except SpecificationError as error:
                 shared.findings += error.findings
             if node.name in found:
-                text = f"the topic {shown(node.name)} is given twice"
+                text = f"the topic {quote(node.name)} is given twice"
                 shared.findings.append(Diagnostic(node.position, "error", text))
             found[node.name] = None if node.cancels else GivenTopic(node.name, topic, node.topic)
     return tuple(one for one in found.values() if one is not None)
@@ -142,6 +142,6 @@ def read_at_start(
                 if name in names.functions and name not in seen:
                     waiting.append(names.functions[name].node)
                 elif name not in seen and is_given(name):
-                    text = f"{shown(name)} may change while {names.name} runs, and a value of the start would not"
-                    yield Diagnostic(start.position, "error", f"{text}; use {shown(name)} where it is needed")
+                    text = f"{quote(name)} may change while {names.name} runs, and a value of the start would not"
+                    yield Diagnostic(start.position, "error", f"{text}; use {quote(name)} where it is needed")
                 seen.add(name)

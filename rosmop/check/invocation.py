@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from rosmop.check.assignables import Value
-from rosmop.check.assignments import mark, marked, require_place, store
+from rosmop.check.assignments import mark, require_place, store, with_mark
 from rosmop.check.conversion import convert, number
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
@@ -51,11 +51,11 @@ class MemberCall:
             return nodes.Call(value_types.STRING, "t_byte", (value.form,))
         return convert(self.scope, value, value_types.STRING)
 
-    def called(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
+    def call(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
         return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
-        return Value(self.called(kind, function, *arguments), self.position)
+        return Value(self.call(kind, function, *arguments), self.position)
 
     def changes(self, value: nodes.Expression) -> Value:
         require_place(self.base, f"`{self.name}`")
@@ -68,7 +68,7 @@ class MemberCall:
             raise SpecificationError.at(
                 self.position, f"`{self.name}`: an array of fixed length cannot change its length"
             )
-        change = marked(mark(self.scope, self.base), self.called(value_types.VOID, function, *arguments))
+        change = with_mark(mark(self.scope, self.base), self.call(value_types.VOID, function, *arguments))
         return Value(change, self.position)
 
 

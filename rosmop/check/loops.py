@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import condition, convert, number
-from rosmop.check.order import settled
+from rosmop.check.order import settle
 from rosmop.check.scope import FunctionScope, LoopScope
 from rosmop.check.vector_members import element_value
 from rosmop.form import nodes
@@ -73,7 +73,7 @@ def write_range_for(scope: FunctionScope, node: tree.RangeForStatement, write: W
     values = scope.value_of(node.values)
     by_value = not node.type.reference or node.type.constant
     if not by_value:
-        first, values = settled(scope, values)
+        first, values = settle(scope, values)
         for each in first:
             scope.evaluate(each)
     if not isinstance(values.type, value_types.VectorType | value_types.StringType):
@@ -139,7 +139,7 @@ def _by_reference(
 
 def write_switch(scope: FunctionScope, node: tree.SwitchStatement, write: Write) -> None:
     value = scope.value_of(node.value)
-    kind = value_types.promoted(value.type)
+    kind = value_types.promote(value.type)
     if not isinstance(kind, value_types.IntegerType):
         raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
     start, flag = scope.temporary(), scope.temporary("k")

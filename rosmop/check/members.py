@@ -14,7 +14,7 @@ from rosmop.runtime import strings
 from rosmop.runtime.numbers import f32
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
-from rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown
+from rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, quote
 
 # Compile member functions of strings: `text.substr(1, 3)`, `text.find("x")`, `text.push_back('c')`.
 
@@ -38,7 +38,7 @@ def _text_front(call: MemberCall) -> Value:
 
 def _text_back(call: MemberCall) -> Value:
     call.count(0)
-    last = call.called(value_types.STRING, "t_last")
+    last = call.call(value_types.STRING, "t_last")
     return Value(nodes.Call(value_types.CHAR, "t_member", (last, _BEGIN), call.site), call.position)
 
 
@@ -58,14 +58,14 @@ def _finder(function: str, start: int) -> Method:
 def _compare(call: MemberCall) -> Value:
     call.count(1)
     compared = nodes.Call(
-        value_types.INT, "t_compare", (call.called(value_types.STRING, "o_charged"), call.text(0))
+        value_types.INT, "t_compare", (call.call(value_types.STRING, "o_charged"), call.text(0))
     )
     return Value(compared, call.position)
 
 
 def _text_append(call: MemberCall) -> Value:
     call.count(1)
-    return call.changes(call.called(value_types.STRING, "t_extend", call.text(0)))
+    return call.changes(call.call(value_types.STRING, "t_extend", call.text(0)))
 
 
 def _text_push(call: MemberCall) -> Value:
@@ -73,7 +73,7 @@ def _text_push(call: MemberCall) -> Value:
     added = nodes.Call(
         value_types.STRING, "t_byte", (convert(call.scope, call.arguments[0], value_types.CHAR),)
     )
-    return call.changes(call.called(value_types.STRING, "t_extend", added))
+    return call.changes(call.call(value_types.STRING, "t_extend", added))
 
 
 def _text_clear(call: MemberCall) -> Value:
@@ -83,30 +83,30 @@ def _text_clear(call: MemberCall) -> Value:
 
 def _text_pop(call: MemberCall) -> Value:
     call.count(0)
-    return call.changes(call.called(value_types.STRING, "t_shorten"))
+    return call.changes(call.call(value_types.STRING, "t_shorten"))
 
 
 def _text_resize(call: MemberCall) -> Value:
     call.count(1, 2)
-    return call.changes(call.called(value_types.STRING, "t_resize", call.index(0), call.index(1, 0)))
+    return call.changes(call.call(value_types.STRING, "t_resize", call.index(0), call.index(1, 0)))
 
 
 def _text_erase(call: MemberCall) -> Value:
     call.count(0, 2)
     return call.changes(
-        call.called(value_types.STRING, "t_erase", call.index(0, 0), call.index(1, strings.NOT_FOUND))
+        call.call(value_types.STRING, "t_erase", call.index(0, 0), call.index(1, strings.NOT_FOUND))
     )
 
 
 def _text_insert(call: MemberCall) -> Value:
     call.count(2)
-    return call.changes(call.called(value_types.STRING, "t_insert", call.index(0), call.text(1)))
+    return call.changes(call.call(value_types.STRING, "t_insert", call.index(0), call.text(1)))
 
 
 def _text_replace(call: MemberCall) -> Value:
     call.count(3)
     return call.changes(
-        call.called(value_types.STRING, "t_replace", call.index(0), call.index(1), call.text(2))
+        call.call(value_types.STRING, "t_replace", call.index(0), call.index(1), call.text(2))
     )
 
 
@@ -156,7 +156,7 @@ def field(scope: FunctionScope, base: Value, name: str, position: Position, site
     members = methods_of(base.type)
     if name in members:
         raise SpecificationError.at(position, f"`{name}` is a function; write `.{name}(…)`")
-    raise SpecificationError.at(position, f"{base.type} has no member {shown(name)}{nearest(name, members)}")
+    raise SpecificationError.at(position, f"{base.type} has no member {quote(name)}{nearest(name, members)}")
 
 
 def constant(scope: FunctionScope, message_type: str, name: str, position: Position) -> Value:
@@ -179,7 +179,7 @@ def call(invocation: MemberCall) -> Value:
         advice = instead((name,))
         hint = f"; {advice}" if advice else nearest(name, methods)
         raise SpecificationError.at(
-            invocation.position, f"{invocation.base.type} has no function {shown(name)}{hint}"
+            invocation.position, f"{invocation.base.type} has no function {quote(name)}{hint}"
         )
     return method(invocation)
 

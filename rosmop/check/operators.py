@@ -30,7 +30,7 @@ class Operands:
     def value(self, result: nodes.Expression) -> Value:
         return Value(result, self.position)
 
-    def refused(self, operator: str, hint: str = "") -> SpecificationError:
+    def type_error(self, operator: str, hint: str = "") -> SpecificationError:
         left, right = self.left.type, self.right.type
         return SpecificationError.at(
             self.position, f"`{operator}` has no meaning for {left} and {right}{hint}"
@@ -48,7 +48,7 @@ def binary(operator: str, operands: Operands) -> Value:
         return _texts(operator, operands)
     if isinstance(left, _MOMENTS) or isinstance(right, _MOMENTS):
         return _moments(operator, operands)
-    cursor = cursors.moved(operator, operands.left, operands.right, operands.position)
+    cursor = cursors.move(operator, operands.left, operands.right, operands.position)
     if cursor is not None:
         return cursor
     if (
@@ -60,7 +60,7 @@ def binary(operator: str, operands: Operands) -> Value:
         return order.after(
             first, operands.value(nodes.Compare(operator, one.form, other.form, operands.site))
         )
-    raise operands.refused(operator, _hint(left, right))
+    raise operands.type_error(operator, _hint(left, right))
 
 
 def _hint(left: Type, right: Type) -> str:
@@ -82,15 +82,15 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
         return _shift(operator, operands)
     kind = value_types.common(operands.left.type, operands.right.type)
     if isinstance(kind, value_types.FloatingType) and (operator == "%" or operator in _BITS):
-        raise operands.refused(operator, "; write `fmod(…)`" if operator == "%" else "")
+        raise operands.type_error(operator, "; write `fmod(…)`" if operator == "%" else "")
     left, right = (number(value.form, kind) for value in (operands.left, operands.right))
     return operands.value(nodes.Arithmetic(kind, operator, left, right, operands.site))
 
 
 def _shift(operator: str, operands: Operands) -> Value:
-    kind, amount = value_types.promoted(operands.left.type), value_types.promoted(operands.right.type)
+    kind, amount = value_types.promote(operands.left.type), value_types.promote(operands.right.type)
     if not isinstance(kind, value_types.IntegerType) or not isinstance(amount, value_types.IntegerType):
-        raise operands.refused(operator)
+        raise operands.type_error(operator)
     left = number(operands.left.form, kind)
     return operands.value(nodes.Arithmetic(kind, operator, left, operands.right.form, operands.site))
 
@@ -100,11 +100,11 @@ def _texts(operator: str, operands: Operands) -> Value:
     if operator == "+":
         return _put_together("o_join", operands)
     if operator == "<<":
-        raise operands.refused(operator, "; write `std::cout << …` or ROS_INFO_STREAM(…)")
+        raise operands.type_error(operator, "; write `std::cout << …` or ROS_INFO_STREAM(…)")
     if operator not in COMPARISONS:
-        raise operands.refused(operator)
+        raise operands.type_error(operator)
     if not (isinstance(left.type, _TEXTS) and isinstance(right.type, _TEXTS)):
-        raise operands.refused(operator, _text_hint(left, right))
+        raise operands.type_error(operator, _text_hint(left, right))
     one, other = (convert(operands.scope, value, value_types.STRING) for value in (left, right))
     short = any(
         isinstance(value.constant, bytes) and len(value.constant) <= nodes.SHORT for value in (left, right)
@@ -112,7 +112,7 @@ def _texts(operator: str, operands: Operands) -> Value:
     return operands.value(nodes.CompareTexts(operator, one, other, short, operands.site))
 
 
-def extended(operands: Operands) -> Value:
+def extend(operands: Operands) -> Value:
     return _put_together("o_extend", operands)
 
 
@@ -122,7 +122,7 @@ def _put_together(function: str, operands: Operands) -> Value:
             other.type, value_types.IntegerType | value_types.FloatingType
         ):
             hint = "; there is no pointer arithmetic: write `std::string(…).substr(1)`"
-            raise operands.refused("+", hint)
+            raise operands.type_error("+", hint)
     texts = (_join(operands, operands.left), _join(operands, operands.right))
     return operands.value(nodes.Call(value_types.STRING, function, texts, operands.site))
 
@@ -154,7 +154,7 @@ def _moments(operator: str, operands: Operands) -> Value:
             return operands.value(nodes.Moment(kind, operator, left.form, right.form, site))
     if operator == "*" and left.type == value_types.DURATION and value_types.is_number(right.type):
         return operands.value(nodes.Call(value_types.DURATION, "o_scaled", (left.form, right.form), site))
-    raise operands.refused(operator, "; write `.toSec()` to calculate in seconds")
+    raise operands.type_error(operator, "; write `.toSec()` to calculate in seconds")
 
 
 def _sum(operator: str, left: Type, right: Type) -> Type | None:
@@ -171,7 +171,7 @@ def unary(operator: str, operand: Value, position: Position, site: int) -> Value
     if operator == "-" and operand.type == value_types.DURATION:
         nothing = nodes.Literal(value_types.DURATION, 0)
         return Value(nodes.Moment(value_types.DURATION, "-", nothing, operand.form, site), position)
-    kind = value_types.promoted(operand.type)
+    kind = value_types.promote(operand.type)
     if not value_types.is_number(kind) or (operator == "~" and not isinstance(kind, value_types.IntegerType)):
         raise SpecificationError.at(position, f"`{operator}` has no meaning for {operand.type}")
     value = number(operand.form, kind)

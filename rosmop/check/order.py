@@ -32,27 +32,27 @@ def after(first: Sequence[nodes.Expression], value: Value) -> Value:
     return replace(value, form=whole, first=(*first, *value.first))
 
 
-def kept(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Expression]:
+def keep(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Expression]:
     if isinstance(value, nodes.Literal):
         return [], value
     name = scope.temporary()
     return [nodes.Assign(value.type, name, value)], nodes.Read(value.type, name)
 
 
-def settled(scope: FunctionScope, value: Value) -> tuple[First, Value]:
+def settle(scope: FunctionScope, value: Value) -> tuple[First, Value]:
     place = value.place
     if place is None:
-        first, read = kept(scope, value.form)
+        first, read = keep(scope, value.form)
         return first, replace(value, form=read, first=())
     if isinstance(place, VariableLvalue):
         return [], value
     assert isinstance(
         place, ElementLvalue | CharacterLvalue | FieldLvalue | TimePartLvalue
     )  # the other kinds
-    first, base = settled(scope, place.base)
+    first, base = settle(scope, place.base)
     settled_place: Lvalue = replace(place, base=base)
     if isinstance(place, ElementLvalue | CharacterLvalue):
-        indexed, index = kept(scope, place.index)
+        indexed, index = keep(scope, place.index)
         first += indexed
         settled_place = replace(place, base=base, index=index)
     read = _read(value.type, settled_place)
@@ -77,14 +77,14 @@ def arguments(scope: FunctionScope, values: Sequence[Value]) -> tuple[First, lis
 
 
 def _in_turn(scope: FunctionScope, values: Sequence[Value]) -> tuple[First, list[Value]]:
-    each = [([], value) if value.pure else settled(scope, value) for value in values]
+    each = [([], value) if value.pure else settle(scope, value) for value in values]
     return [before for first, _ in each for before in first], [value for _, value in each]
 
 
 def of_member(scope: FunctionScope, base: Value, values: Sequence[Value]) -> tuple[First, Value, list[Value]]:
     if all(value.pure for value in values) and (base.pure or base.place is None):
         return [], base, list(values)
-    first, base = ([], base) if base.pure and base.place is None else settled(scope, base)
+    first, base = ([], base) if base.pure and base.place is None else settle(scope, base)
     before, ordered = _in_turn(scope, values)
     return [*first, *before], base, ordered
 
@@ -99,8 +99,8 @@ def of_change(scope: FunctionScope, target: Value, value: Value) -> tuple[First,
         return [], target, value
     if value_types.is_number(value.type):  # for a class, only the place is evaluated first
         value = replace(value, place=None)
-    first, value = settled(scope, value)
-    before, target = ([], target) if target.pure else settled(scope, target)
+    first, value = settle(scope, value)
+    before, target = ([], target) if target.pure else settle(scope, target)
     return [*first, *before], target, value
 
 
@@ -109,6 +109,6 @@ def of_assignment(
 ) -> tuple[First, Value, nodes.Expression]:
     if target.pure and (_is_variable(target) or not nodes.acts(value)):
         return [], target, value
-    first, read = kept(scope, value)
-    before, target = ([], target) if target.pure else settled(scope, target)
+    first, read = keep(scope, value)
+    before, target = ([], target) if target.pure else settle(scope, target)
     return [*first, *before], target, read

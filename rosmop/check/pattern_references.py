@@ -31,7 +31,7 @@ _SHAPE = "`globally: a as A forbids b {x < @A.x}`, or `b as B requires a {x < @B
 def with_references(specification: tree.Specification) -> tree.Specification:
     for number, node in enumerate(specification.properties, 1):
         if _refers(node):
-            specification = _Rewriting(specification, node, number).done()
+            specification = _Rewriting(specification, node, number).rewrite()
     return specification
 
 
@@ -67,7 +67,7 @@ class _Rewriting:
         self._name = f"{self._late.name}_{self._alias}"
         self._prefix = _PREFIX + str(number)
 
-    def done(self) -> tree.Specification:
+    def rewrite(self) -> tree.Specification:
         operator, early, late = self._sides()
         specification, node = self._specification, self._node
         if any(event.name == self._name for event in specification.events):
@@ -145,9 +145,9 @@ class _Rewriting:
         trigger, position = event.trigger, self._node.formula_position
         assert isinstance(trigger, tree.MessageTrigger)  # `_event` checks this
         test: tree.Expression = tree.CallExpression(
-            position, tree.Name(position, (_hidden(f"{self._prefix}violates"),)), (late,)
+            position, tree.Name(position, (_hide(f"{self._prefix}violates"),)), (late,)
         )
-        opened = tree.Name(position, (_hidden(f"{self._prefix}open"),))
+        opened = tree.Name(position, (_hide(f"{self._prefix}open"),))
         test = tree.BinaryExpression(position, "&&", opened, test)
         if trigger.when is not None:
             test = tree.BinaryExpression(position, "&&", trigger.when, test)
@@ -214,7 +214,7 @@ class _Rewriting:
             [specification] = parse(f"s() {{ {members} }}", position.file).specifications
         except SpecificationError as error:
             self._refuse(f"the condition is not valid: {error.findings[0].text}")
-        moved: tree.Specification = _moved(specification, position)
+        moved: tree.Specification = _move(specification, position)
         return moved
 
     def _refuse(self, text: str) -> NoReturn:
@@ -225,36 +225,36 @@ def _is_reference(node: tree.SyntaxNode) -> bool:
     return isinstance(node, tree.Name) and node.parts[0].startswith(_INSIDE)
 
 
-def _mapped(node: Any, change: Any) -> Any:
+def _map(node: Any, change: Any) -> Any:
     if isinstance(node, tuple):
-        return tuple(_mapped(part, change) for part in node)
+        return tuple(_map(part, change) for part in node)
     if not isinstance(node, tree.SyntaxNode):
         return node
     names = [field.name for field in fields(node)]
-    parts = [_mapped(part, change) for part in tree.fields_of(node)]
+    parts = [_map(part, change) for part in tree.fields_of(node)]
     return change(replace(node, **dict(zip(names, parts, strict=True))))
 
 
-def _moved(node: Any, position: Position) -> Any:
-    def moved(one: tree.SyntaxNode) -> tree.SyntaxNode:
+def _move(node: Any, position: Position) -> Any:
+    def move(one: tree.SyntaxNode) -> tree.SyntaxNode:
         one = replace(one, position=position)
         if isinstance(one, tree.Name):
-            return replace(one, parts=tuple(map(_hidden, one.parts)))
+            return replace(one, parts=tuple(map(_hide, one.parts)))
         if isinstance(one, tree.Declarator | tree.FunctionDefinition):
-            return replace(one, name=_hidden(one.name))
+            return replace(one, name=_hide(one.name))
         return one
 
-    return _mapped(node, moved)
+    return _map(node, move)
 
 
-def _hidden(name: str) -> str:
+def _hide(name: str) -> str:
     return name.replace(_PREFIX, "pattern ")
 
 
 def _without_prefix(node: Any) -> Any:
-    def renamed(one: tree.SyntaxNode) -> tree.SyntaxNode:
+    def rename(one: tree.SyntaxNode) -> tree.SyntaxNode:
         if not isinstance(one, tree.Name) or not _is_reference(one):
             return one
         return replace(one, parts=(one.parts[0].removeprefix(_INSIDE), *one.parts[1:]))
 
-    return _mapped(node, renamed)
+    return _map(node, rename)

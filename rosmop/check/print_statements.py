@@ -18,7 +18,7 @@ _SIGNED, _UNSIGNED, _FLOATING = b"di", b"uoxX", b"fFeEgGaA"
 _TEXTS = (value_types.StringType, value_types.CharactersType)
 
 
-def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
+def compile_format(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
@@ -121,7 +121,7 @@ def _conversion(
 
 
 def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expression:
-    kind = value_types.promoted(value.type)
+    kind = value_types.promote(value.type)
     bits = kind.bits if isinstance(kind, value_types.IntegerType) else 64
     bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)
     target = value_types.IntegerType(bits, letter in _SIGNED, "")
@@ -156,7 +156,7 @@ class OutputStream:
         self._fixed = False
         self._precision: nodes.Expression | None = None
 
-    def manipulated(self, node: tree.Expression, value: Value | None) -> bool:
+    def apply_manipulator(self, node: tree.Expression, value: Value | None) -> bool:
         parts = node.parts if isinstance(node, tree.Name) else ()
         name = parts[-1] if parts and parts[:-1] in ((), ("std",)) else ""
         if name in ("fixed", "defaultfloat", "scientific"):

@@ -19,7 +19,7 @@ from rosmop.form.findings import Diagnostic
 from rosmop.logics.property_lint import TIME, VerdictGraph, graph_of
 from rosmop.run.interpreter import Interpreter
 from rosmop.runtime.wire import WireMessage
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 
 _CHANGING = (nodes.Now, nodes.SenderName, nodes.Altered)
 
@@ -36,7 +36,7 @@ def with_remedies_checked(
         return [*compiled]
     trial = _Trial(shared, compiled)
     return [
-        replace(one, properties=tuple(trial.described(place, code) for code in one.properties))
+        replace(one, properties=tuple(trial.describe(place, code) for code in one.properties))
         for place, one in enumerate(compiled)
     ]
 
@@ -58,7 +58,7 @@ class _Trial:
             if name not in start:
                 self._changing.update(function.shared, variables.intersection(_changed_parts(function)))
 
-    def described(self, place: int, code: PropertyCode) -> PropertyCode:
+    def describe(self, place: int, code: PropertyCode) -> PropertyCode:
         if code.remedy is None:
             return code
         specification, remedy = self._compiled[place], code.remedy
@@ -80,19 +80,19 @@ class _Trial:
         self, place: int, specification: SpecificationCode, remedy: RemedyCode, event: EventCode
     ) -> str:
         """Return what depends on the state, or nothing. Raises `_UnansweredError` if no due message comes."""
-        awaited, topic = shown(event.name), event.topic or ""
+        awaited, topic = quote(event.name), event.topic or ""
         if not self._is_fixed(remedy.function):
             return f"{awaited} accepts it, and no later monitor suppresses it"
         self._begin()
         messages = self._published(remedy, topic)
         if not messages:
-            text = f"{shown(remedy.name)} publishes no message on {topic}, where {awaited} is due"
+            text = f"{quote(remedy.name)} publishes no message on {topic}, where {awaited} is due"
             raise _UnansweredError(f"{text}; publish it on each path")
         if not self._is_fixed(remedy.accepts):
             return f"{awaited} accepts it, and no later monitor suppresses it"
         messages = [data for data in messages if self._accepts(remedy, topic, data)]
         if not messages:
-            text = f"{awaited} does not accept the message that {shown(remedy.name)} publishes on {topic}"
+            text = f"{awaited} does not accept the message that {quote(remedy.name)} publishes on {topic}"
             raise _UnansweredError(f"{text}: its pattern or its `when` does not fit; publish one that fits")
         first = place if specification.ordered else place + 1
         for later in self._compiled[first:]:
@@ -101,12 +101,12 @@ class _Trial:
                 return f"{later.name} lets the message pass"
             messages = [data for data in left if data is not None and data is not False]
             if not messages:
-                text = f"{later.name} drops the message that {shown(remedy.name)} publishes on {topic}"
+                text = f"{later.name} drops the message that {quote(remedy.name)} publishes on {topic}"
                 advice = f"; let {later.name} come first: `order {later.name} < {specification.name};`"
                 raise _UnansweredError(text if later is specification else text + advice)
             if not any(self._accepts(remedy, topic, data) for data in messages):
                 text = (
-                    f"the message that {shown(remedy.name)} publishes on {topic} is changed by {later.name}"
+                    f"the message that {quote(remedy.name)} publishes on {topic} is changed by {later.name}"
                 )
                 raise _UnansweredError(
                     f"{text}, so that {awaited} no longer accepts it; change their order, or one of them"

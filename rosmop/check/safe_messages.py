@@ -12,7 +12,7 @@ from rosmop.form.findings import SpecificationError
 from rosmop.form.sites import Site
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import MessageTypes, shown
+from rosmop.types.messages import MessageTypes, quote
 from rosmop.types.resolve import record
 
 _HEADER = "std_msgs/Header"
@@ -24,7 +24,7 @@ def declare_safes(
 ) -> None:
     for node in specification.safes:
         try:
-            safe = _compiled(shared, names, specification, node)
+            safe = _compile(shared, names, specification, node)
         except SpecificationError as error:
             shared.findings += error.findings
             names.misdeclared.add("STOP")
@@ -33,7 +33,7 @@ def declare_safes(
         shared.publications.append(Publication(names.name, safe.topic, safe.type, node.position, safe=True))
 
 
-def _compiled(
+def _compile(
     shared: CompilationContext,
     names: SpecificationNames,
     specification: tree.Specification,
@@ -81,7 +81,7 @@ def _assign(
     path = binding.path
     field = type_of_path(scope.messages, kind, path)
     if binding.constant is None:
-        name = shown(binding.variable or "")
+        name = quote(binding.variable or "")
         text = f"the fields of a safe message are constants, because it is serialized once; {name} is not one"
         raise SpecificationError.at(binding.value_position, text)
     if stamped and len(path) > 1 and path[1].name in _SENT_WITH and _first(scope, kind) == path[0].name:

@@ -14,7 +14,7 @@ from rosmop.runtime.values import ValueCodec
 from rosmop.text import tree
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
-from rosmop.types.messages import MessageTypes, nearest, shown
+from rosmop.types.messages import MessageTypes, nearest, quote
 from rosmop.types.value_types import Type
 
 Role = Literal["action", "timer", "handler", "init", "function"]
@@ -119,14 +119,14 @@ class SharedVariables:
         if len(owners) > 1:
             both = " and ".join(other.name for other in owners[:2])
             raise SpecificationError.at(
-                position, f"{shown(name)} is a variable of {both}; give one of them another name"
+                position, f"{quote(name)} is a variable of {both}; give one of them another name"
             )
         if not owners:
             return None, None
         variable = owners[0].variables[name]
         if variable.sliced:
             raise SpecificationError.at(
-                position, f"each slice of {owners[0].name} has its own {shown(name)}: others cannot see it"
+                position, f"each slice of {owners[0].name} has its own {quote(name)}: others cannot see it"
             )
         return variable, owners[0].name
 
@@ -249,7 +249,7 @@ class FunctionScope:
         block = self._blocks[-1]
         if variable.name in block:
             raise SpecificationError.at(
-                variable.position, f"{shown(variable.name)} is declared twice in this block"
+                variable.position, f"{quote(variable.name)} is declared twice in this block"
             )
         block[variable.name] = variable
         if variable.alias is None:
@@ -261,17 +261,17 @@ class FunctionScope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        variable, owner = self._known(name, position)
+        variable, owner = self._find(name, position)
         if owner is not None:
             self.names.uses.add(owner)
         return variable
 
-    def _known(self, name: str, position: Position) -> tuple[Variable | None, str | None]:
+    def _find(self, name: str, position: Position) -> tuple[Variable | None, str | None]:
         for block in reversed(self._blocks):
             if name in block:
                 return block[name], None
         if name in self.below:
-            raise SpecificationError.at(position, f"{shown(name)} is declared below; move its declaration up")
+            raise SpecificationError.at(position, f"{quote(name)} is declared below; move its declaration up")
         own = self.names.variables.get(name)
         return (own, None) if own is not None else self.shared.variables.foreign(self.names, name, position)
 
@@ -287,12 +287,12 @@ class FunctionScope:
         known += filter(str.isidentifier, [*self.names.variables, *self.names.functions])
         advice = instead(name.split("::"))
         hint = f"; {advice}" if advice else nearest(name, known)
-        return SpecificationError.at(position, f"unknown {what} {shown(name)}{hint}")
+        return SpecificationError.at(position, f"unknown {what} {quote(name)}{hint}")
 
-    def published(self, topic: str, kind: str, position: Position) -> None:
+    def note_publication(self, topic: str, kind: str, position: Position) -> None:
         self.shared.publications.append(Publication(self.names.name, topic, kind, position))
 
-    def called(self, service: str, kind: str, position: Position) -> None:
+    def note_call(self, service: str, kind: str, position: Position) -> None:
         self.shared.calls.append(Publication(self.names.name, service, kind, position))
 
     # Statements
@@ -350,7 +350,7 @@ class FunctionScope:
                 continue
             seen.add(name)
             try:
-                variable, _ = self._known(name, node.position)
+                variable, _ = self._find(name, node.position)
             except SpecificationError:
                 continue
             if variable is not None and variable.alias is None:

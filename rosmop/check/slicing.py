@@ -15,7 +15,7 @@ from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.past_monitors import PastProperty
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 from rosmop.types.resolve import resolve
 
 MAX_PARAMETERS = 6
@@ -37,7 +37,7 @@ def declare_parameters(
                 raise SpecificationError.at(parameter.position, text)
             if parameter.name in names.variables:
                 raise SpecificationError.at(
-                    parameter.position, f"the parameter {shown(parameter.name)} occurs twice"
+                    parameter.position, f"the parameter {quote(parameter.name)} occurs twice"
                 )
         except SpecificationError as error:
             shared.findings += error.findings
@@ -61,7 +61,7 @@ def check_own(names: SpecificationNames, variable: Variable) -> None:
         or isinstance(variable.type, value_types.TimeType | value_types.DurationType)
     ):
         text = (
-            f"each slice of {names.name} has its own {shown(variable.name)}, so it is a number or a time; "
+            f"each slice of {names.name} has its own {quote(variable.name)}, so it is a number or a time; "
             "write `static` for one that all slices share"
         )
         raise SpecificationError.at(variable.position, text)
@@ -112,10 +112,10 @@ def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, 
 def creates(specification: tree.Specification, event: tree.EventDefinition) -> bool:
     """Whether a slice may begin with an event: with any event unless there is a `creation event`."""
 
-    def marked(event: tree.EventDefinition) -> bool:
+    def is_marked(event: tree.EventDefinition) -> bool:
         return any(modifier.parts == ("creation",) for modifier in event.modifiers)
 
-    return marked(event) or not any(map(marked, specification.events))
+    return is_marked(event) or not any(map(is_marked, specification.events))
 
 
 def acts(function: nodes.Function, shared: CompilationContext) -> bool:
@@ -151,5 +151,5 @@ def check_parameters(
     bound = {number for event in specification.events for number in binds(names, event)}
     for number, (name, variable) in enumerate(names.parameters.items()):
         if number not in bound:
-            text = f"no event binds the parameter {shown(name)}: give an event a parameter of that name"
+            text = f"no event binds the parameter {quote(name)}: give an event a parameter of that name"
             shared.findings.append(Diagnostic(variable.position, "error", text))

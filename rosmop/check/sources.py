@@ -51,11 +51,11 @@ def with_observed_topics(compiled: Compiled) -> Compiled:
         for event in code.events:
             if event.function in observing:
                 name = event.key or event.function
-                functions[name] = _checked(functions[name], event, compiled, symbols)
+                functions[name] = _check(functions[name], event, compiled, symbols)
     return replace(compiled, functions=functions, sites=symbols.sites)
 
 
-def _checked(
+def _check(
     function: nodes.Function, event: EventCode, compiled: Compiled, symbols: Symbols
 ) -> nodes.Function:
     found: list[nodes.Statement] = []

@@ -41,7 +41,7 @@ from rosmop.check.specification_lint import (
     lint_statements,
     unused_events,
 )
-from rosmop.check.traps import Phases, ordered, phases_of, rival_changes, traps, unknown_phases
+from rosmop.check.traps import Phases, evaluation_order, phases_of, rival_changes, traps, unknown_phases
 from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, Publication, SpecificationCode
@@ -49,7 +49,7 @@ from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
 from rosmop.text import tree
-from rosmop.types.messages import MessageTypes, nearest, shown
+from rosmop.types.messages import MessageTypes, nearest, quote
 from roswire.definitions import Definitions
 
 # Find the message types that a specification uses. Its state survives new definitions only if they are unchanged.
@@ -57,7 +57,7 @@ from roswire.definitions import Definitions
 # The result may include an unused type, if a string equals the name of a type.
 
 
-def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
+def reached_types(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
     messages, services = set(definitions.message_types), set(definitions.service_types)
     waiting: list[str] = []
     for name in set(_names(node)):
@@ -182,11 +182,11 @@ def compile_files(
     pairs = [(file, specification) for file in files for specification in file.specifications]
     orders = [order for file in files for order in file.orders]
     compiled: Sequence[SpecificationCode] = ()
-    phases = _noted(shared, partial(phases_of, orders, [specification for _, specification in pairs]))
+    phases = _note_findings(shared, partial(phases_of, orders, [specification for _, specification in pairs]))
     if phases is not None:
         names = [specification.name for _, specification in pairs]
         shared.findings += unknown_phases(orders, names)
-        pairs = [pairs[place] for place in ordered(names, phases)]
+        pairs = [pairs[place] for place in evaluation_order(names, phases)]
         named = frozenset(name.parts[0] for order in orders for name in order.names)
         compiled = _compile_all(shared, pairs, topics, phases, named)
     findings = list(dict.fromkeys(shared.findings))
@@ -222,7 +222,7 @@ def _compile_all(
 ) -> list[SpecificationCode]:
     given = [topics.get(specification.name, {}) for _, specification in originals]
     renamed = [(file, with_topics(one, own)) for (file, one), own in zip(originals, given, strict=True)]
-    pairs = [(file, _rewritten(shared, specification)) for file, specification in renamed]
+    pairs = [(file, _rewrite(shared, specification)) for file, specification in renamed]
     names = [_declare(shared, specification) for _, specification in pairs]
     _check_names(shared, [specification for _, specification in pairs])
     compiled = []
@@ -246,8 +246,8 @@ def _compile_all(
     return compiled
 
 
-def _rewritten(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
-    rewritten = _noted(shared, partial(with_references, specification))
+def _rewrite(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
+    rewritten = _note_findings(shared, partial(with_references, specification))
     return without_references(specification) if rewritten is None else rewritten
 
 
@@ -271,7 +271,7 @@ def _check_names(shared: CompilationContext, specifications: Sequence[tree.Speci
         if specification.name in seen:
             first = seen[specification.name].position
             text = (
-                f"there is another specification {shown(specification.name)} at {first}; give it another name"
+                f"there is another specification {quote(specification.name)} at {first}; give it another name"
             )
             shared.findings.append(Diagnostic(specification.position, "error", text))
         seen[specification.name] = specification
@@ -293,7 +293,7 @@ def _same_names(specifications: Sequence[SpecificationNames]) -> Iterator[Diagno
                 and name in other.variables
                 and not (variable.sliced or other.variables[name].sliced)
             ):
-                text = f"{shown(name)} is also a variable of {other.name}; each has its own"
+                text = f"{quote(name)} is also a variable of {other.name}; each has its own"
                 yield Diagnostic(variable.position, "warning", text)
 
 
@@ -308,11 +308,11 @@ def _compile(
     declare_safes(shared, names, specification)
     shared.findings += read_at_start(shared, names, specification)
     withheld = withholdings(shared, names, specification)
-    start = _noted(shared, partial(compile_start, shared, names, specification))
+    start = _note_findings(shared, partial(compile_start, shared, names, specification))
     for function in names.functions.values():
-        _noted(shared, partial(compile_function, shared, names, function))
+        _note_findings(shared, partial(compile_function, shared, names, function))
     events = [
-        _noted(shared, partial(compile_event, shared, names, specification, event))
+        _note_findings(shared, partial(compile_event, shared, names, specification, event))
         for event in specification.events
     ]
     check_parameters(shared, names, specification)
@@ -335,7 +335,7 @@ def _compile(
         specification.name,
         specification.position,
         b"",  # the caller knows the topics as they are written
-        reached(specification, shared.messages.definitions),
+        reached_types(specification, shared.messages.definitions),
         file.name,
         any(modifier.parts == ("hold",) for modifier in specification.modifiers),
         start,
@@ -373,7 +373,7 @@ def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
             yield Diagnostic(loan.position, "error", text)
 
 
-def _noted(shared: CompilationContext, action: Callable[[], _T]) -> _T | None:
+def _note_findings(shared: CompilationContext, action: Callable[[], _T]) -> _T | None:
     try:
         return action()
     except SpecificationError as error:
@@ -386,31 +386,31 @@ def _check_head(shared: CompilationContext, specification: tree.Specification) -
         word = modifier.parts[0]
         if word in IGNORED_MODIFIERS:
             shared.findings.append(
-                Diagnostic(modifier.position, "warning", f"{shown(word)} has no meaning here")
+                Diagnostic(modifier.position, "warning", f"{quote(word)} has no meaning here")
             )
         elif word not in MODIFIERS:
-            text = f"{shown(word)} is not a modifier of a specification{nearest(word, MODIFIERS)}"
+            text = f"{quote(word)} is not a modifier of a specification{nearest(word, MODIFIERS)}"
             shared.findings.append(Diagnostic(modifier.position, "error", text))
     if {modifier.parts[0] for modifier in specification.modifiers} >= MODIFIERS:
         text = "`hold` and `begin` exclude each other: leave one of them out"
         shared.findings.append(Diagnostic(specification.position, "error", text))
     if specification.name == _TAKEN:
-        text = f"a specification cannot be named {shown(_TAKEN)}: the REST path /v1/monitors/{_TAKEN} is the history"
+        text = f"a specification cannot be named {quote(_TAKEN)}: the REST path /v1/monitors/{_TAKEN} is the history"
         shared.findings.append(Diagnostic(specification.position, "error", text))
     if not specification.events:
-        text = f"the specification {shown(specification.name)} has no event; write `event name() /topic …`"
+        text = f"the specification {quote(specification.name)} has no event; write `event name() /topic …`"
         shared.findings.append(Diagnostic(specification.position, "error", text))
     seen = set()
     for event in specification.events:
         if event.name in seen:
             shared.findings.append(
-                Diagnostic(event.position, "error", f"the event {shown(event.name)} occurs twice")
+                Diagnostic(event.position, "error", f"the event {quote(event.name)} occurs twice")
             )
         seen.add(event.name)
         for modifier in event.modifiers:
             if specification.parameters and modifier.parts == ("creation",):
                 continue
-            text = f"the modifier {shown(modifier.parts[0])} of an event has no meaning here"
+            text = f"the modifier {quote(modifier.parts[0])} of an event has no meaning here"
             shared.findings.append(Diagnostic(modifier.position, "warning", text))
 
 
@@ -435,7 +435,7 @@ def _property(
     if why is not None:
         shared.findings.append(Diagnostic(node.position, "error", why))
     handlers: dict[str, str] = {}
-    remedy = _noted(shared, partial(remedy_code, shared, names, specification, compiled, node))
+    remedy = _note_findings(shared, partial(remedy_code, shared, names, specification, compiled, node))
     if compiled.remedy is not None and remedy is None:
         return None
     for handler in with_remedy(compiled, node):
@@ -444,7 +444,7 @@ def _property(
             shared.findings.append(Diagnostic(handler.position, "error", text))
             continue
         refused = blocking_refused(compiled, specification, handler.category)
-        function = _noted(shared, partial(compile_handler, shared, names, handler, refused))
+        function = _note_findings(shared, partial(compile_handler, shared, names, handler, refused))
         if function is not None:
             handlers[handler.category] = function
     shared.findings += lint_property(compiled, node)
@@ -482,7 +482,7 @@ def _handler_refused(
         return f"@{handler.category} is handled twice; put both into one handler"
     if handler.category not in compiled.categories:
         known = nearest(handler.category, compiled.categories)
-        return f"{compiled.logic} has no category {shown(handler.category)} here{known}"
+        return f"{compiled.logic} has no category {quote(handler.category)} here{known}"
     return None
 
 

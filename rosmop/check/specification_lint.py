@@ -14,7 +14,7 @@ from rosmop.logics.property_lint import analyse
 from rosmop.run.state import MAX_STATE_BYTES
 from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 
 _DEFAULT = re.compile(r"[\[,]\s*+default\s++[A-Za-z_]")
 _WITHOUT_UNIT = re.compile(
@@ -65,7 +65,7 @@ def kept_slices(
         Diagnostic(
             event.position,
             "warning",
-            f"the slices of {shown(name)} never end: the timer {shown(event.name)} does more than change their"
+            f"the slices of {quote(name)} never end: the timer {quote(event.name)} does more than change their"
             " variables, so each may act again at any time;"
             " put the time limit into a property (`pattern … within`, `tfsm`)",
         )
@@ -117,7 +117,7 @@ def unused_events(specification: tree.Specification, properties: Sequence[_HasPr
             return []
         named.update(logic.implicit_events)
     return [
-        Diagnostic(event.position, "warning", f"no property uses the event {shown(event.name)}")
+        Diagnostic(event.position, "warning", f"no property uses the event {quote(event.name)}")
         for event in specification.events
         if event.name not in named
     ]

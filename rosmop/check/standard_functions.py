@@ -8,7 +8,7 @@ from rosmop.check import function_library
 from rosmop.check.assignables import Value
 from rosmop.check.assignments import require_original, store
 from rosmop.check.conversion import convert, number, require_number
-from rosmop.check.print_statements import formatted
+from rosmop.check.print_statements import compile_format
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.findings import Position, SpecificationError
@@ -120,7 +120,7 @@ def _absolute_of_long(call: Arguments) -> Value:
 def _absolute(call: Arguments) -> Value:
     call.count(1)
     require_number(call.values[0], "`abs`")
-    kind = value_types.promoted(call.values[0].type)
+    kind = value_types.promote(call.values[0].type)
     return call.result(nodes.Unary(kind, "abs", number(call.values[0].form, kind)))
 
 
@@ -265,7 +265,7 @@ def _fills(function: str) -> Function:
     def fill(call: Arguments) -> Value:
         call.count(2)
         target = _buffer(call)
-        return _stored(call, target, function, call.text(1))
+        return _store(call, target, function, call.text(1))
 
     return fill
 
@@ -274,10 +274,10 @@ def _fills_at_most(call: Arguments) -> Value:
     call.count(3)
     target = _buffer(call)
     limit = number(call.values[2].form, value_types.ULONG)
-    return _stored(call, target, "h_filled_at_most", call.text(1), limit)
+    return _store(call, target, "h_filled_at_most", call.text(1), limit)
 
 
-def _stored(call: Arguments, target: Value, function: str, *arguments: nodes.Expression) -> Value:
+def _store(call: Arguments, target: Value, function: str, *arguments: nodes.Expression) -> Value:
     filled = nodes.Call(value_types.CHARACTERS, function, (target.form, *arguments), call.site)
     return Value(store(call.scope, target, filled), call.position)
 
@@ -285,22 +285,22 @@ def _stored(call: Arguments, target: Value, function: str, *arguments: nodes.Exp
 def _prints(call: Arguments) -> Value:
     call.count(2, 100)
     target = _buffer(call)
-    return _printed(call, target, "h_filled", formatted(call.scope, call.values[1], call.values[2:]))
+    return _print(call, target, "h_filled", compile_format(call.scope, call.values[1], call.values[2:]))
 
 
 def _prints_at_most(call: Arguments) -> Value:
     call.count(3, 100)
     target = _buffer(call)
     limit = number(call.values[1].form, value_types.ULONG)
-    text = formatted(call.scope, call.values[2], call.values[3:])
-    return _printed(call, target, "h_printed", text, limit)
+    text = compile_format(call.scope, call.values[2], call.values[3:])
+    return _print(call, target, "h_printed", text, limit)
 
 
-def _printed(
+def _print(
     call: Arguments, target: Value, function: str, text: nodes.Expression, *arguments: nodes.Expression
 ) -> Value:
     made = nodes.Read(value_types.STRING, call.scope.temporary())
-    filled = _stored(call, target, function, made, *arguments)
+    filled = _store(call, target, function, made, *arguments)
     length = nodes.Call(value_types.INT, "h_len", (made,))
     items = (nodes.Assign(value_types.STRING, made.name, text), filled.form, length)
     return Value(nodes.Sequence(value_types.INT, items, -1), call.position)

@@ -7,7 +7,7 @@ from typing import Any
 
 from rosmop.check import call_expressions, loops
 from rosmop.check.assignments import write_store
-from rosmop.check.call_expressions import converted, elements
+from rosmop.check.call_expressions import convert_value, elements
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.expressions import assignment
 from rosmop.check.scope import FunctionScope
@@ -18,7 +18,7 @@ from rosmop.runtime import numbers
 from rosmop.runtime.values import struct_code
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import nearest, shown
+from rosmop.types.messages import nearest, quote
 from rosmop.types.resolve import record, resolve
 from roswire import names
 from roswire.counted import counted
@@ -62,7 +62,7 @@ def _declare(scope: FunctionScope, node: tree.Declaration) -> None:
             scope.add(nodes.Allocate(scope.lines.site, size))
         variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
         variable.copied = _is_copy(scope, declarator, kind)
-        variable.known = known(scope, node.type, declarator, kind)
+        variable.known = literal_constant(scope, node.type, declarator, kind)
         variable.table = table(scope, node.type, declarator, kind)
         if variable.table is None:
             scope.evaluate(nodes.Assign(kind, variable.code, value))
@@ -94,7 +94,7 @@ def table(
     return raw if len(raw) <= MAX_TABLE else None
 
 
-def known(
+def literal_constant(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
     """Return the value of a `const` literal, which array sizes and cases need, or None."""
@@ -107,7 +107,7 @@ def known(
         return None
     value = scope.value_of(node).constant
     if isinstance(kind, value_types.FloatingType):
-        return None if value is None or isinstance(value, bytes) else _rounded(float(value), kind)
+        return None if value is None or isinstance(value, bytes) else _round(float(value), kind)
     if not isinstance(value, int):
         return None
     return (
@@ -117,7 +117,7 @@ def known(
     )
 
 
-def _rounded(value: float, kind: value_types.FloatingType) -> float:
+def _round(value: float, kind: value_types.FloatingType) -> float:
     return value if kind.bits == 64 else numbers.f32(value)
 
 
@@ -136,7 +136,7 @@ def initial(
         return kind, convert(scope, value, kind)
     if declarator.value is None:
         return kind, nodes.Zero(kind)
-    return kind, converted(scope, declarator.value, kind)
+    return kind, convert_value(scope, declarator.value, kind)
 
 
 def _deduce(scope: FunctionScope, declarator: tree.Declarator) -> tuple[value_types.Type, nodes.Expression]:
@@ -162,7 +162,7 @@ def _array(
         )
         if declarator.value is None:
             return value_types.CHARACTERS, zeros
-        text = converted(scope, declarator.value, value_types.STRING)
+        text = convert_value(scope, declarator.value, value_types.STRING)
         if size is None:
             return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "t_zeroed", (text,), site)
         if isinstance(declarator.value, tree.StringLiteral) and len(declarator.value.value) >= size:
@@ -206,7 +206,7 @@ def _evaluate(scope: FunctionScope, node: tree.ExpressionStatement) -> None:
     expression = node.expression
     level = call_expressions.stream_of(expression)
     if level is not None:
-        scope.evaluate(call_expressions.streamed(scope, node, level, expression, headed=True).form)
+        scope.evaluate(call_expressions.compile_stream(scope, node, level, expression, headed=True).form)
     elif isinstance(expression, tree.Assignment):
         first, target, assigned = assignment(scope, expression)
         for each in first:
@@ -267,7 +267,7 @@ def _return_value(scope: FunctionScope, node: tree.ReturnStatement) -> None:
         )
         raise SpecificationError.at(node.position, hint)
     nothing = nodes.Literal(value_types.VOID, None)
-    value = nothing if node.value is None else converted(scope, node.value, scope.result)
+    value = nothing if node.value is None else convert_value(scope, node.value, scope.result)
     scope.add(nodes.Return(scope.lines.site, value, tuple(variable.code for variable in scope.references)))
 
 
@@ -316,7 +316,7 @@ def _publish(scope: FunctionScope, node: tree.PublishStatement) -> None:
     if value.type != kind:
         raise SpecificationError.at(value.position, f"this is {value.type}, but {kind} is published here")
     scope.add(nodes.Publish(scope.lines.site, node.topic, kind, value.form, scope.temporary()))
-    scope.published(node.topic, node.type, node.position)
+    scope.note_publication(node.topic, node.type, node.position)
 
 
 def _call_service(scope: FunctionScope, node: tree.CallStatement) -> None:
@@ -324,7 +324,7 @@ def _call_service(scope: FunctionScope, node: tree.CallStatement) -> None:
     try:
         service = scope.messages.definitions.service(node.type)
     except DefinitionError:
-        text = f"unknown service type {shown(node.type)}{nearest(node.type, scope.messages.definitions.service_types)}"
+        text = f"unknown service type {quote(node.type)}{nearest(node.type, scope.messages.definitions.service_types)}"
         raise SpecificationError.at(
             node.type_position, f"{text}; others need a .srv file (--msg DIR)"
         ) from None
@@ -333,13 +333,13 @@ def _call_service(scope: FunctionScope, node: tree.CallStatement) -> None:
     if value.type != kind:
         raise SpecificationError.at(value.position, f"this is {value.type}, but the request is a {kind}")
     scope.add(nodes.Publish(scope.lines.site, node.service, kind, value.form, scope.temporary(), node.type))
-    scope.called(node.service, node.type, node.position)
+    scope.note_call(node.service, node.type, node.position)
 
 
 def check_topic(topic: str, position: Position) -> None:
     if not names.is_global_name(topic):
         hint = f"; write `/{topic}`" if names.is_global_name("/" + topic) else "; write for example `/a/b`"
-        raise SpecificationError.at(position, f"{shown(topic)} is not a global name{hint}")
+        raise SpecificationError.at(position, f"{quote(topic)} is not a global name{hint}")
 
 
 _KINDS: Mapping[type[tree.Statement], Callable[[FunctionScope, Any], None]] = {

@@ -7,7 +7,7 @@ from itertools import combinations
 
 from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.text import tree
-from rosmop.types.messages import nearest, shown
+from rosmop.types.messages import nearest, quote
 
 # Order the specifications of a set by their phases and by `order` statements.
 #
@@ -32,11 +32,11 @@ def phases_of(
         names = [name.parts[0] for name in order.names]
         for place, name in enumerate(names):
             behind.setdefault(name, set()).update(names[place + 1 :])
-    pairs = frozenset((first, second) for first in behind for second in _reached(behind, first))
+    pairs = frozenset((first, second) for first in behind for second in _reachable(behind, first))
     for order in orders:
         for word in order.names:
             if (word.parts[0], word.parts[0]) in pairs:
-                text = f"{shown(word.parts[0])} would come before itself; leave out an `order` statement or a phase"
+                text = f"{quote(word.parts[0])} would come before itself; leave out an `order` statement or a phase"
                 raise SpecificationError.at(word.position, text)
     return pairs
 
@@ -44,12 +44,12 @@ def phases_of(
 def _place(phase: tree.Name) -> int:
     name = phase.parts[0]
     if name not in NAMED:
-        text = f"there is no phase {shown(name)}{nearest(name, NAMED)}; there are {', '.join(NAMED)}"
+        text = f"there is no phase {quote(name)}{nearest(name, NAMED)}; there are {', '.join(NAMED)}"
         raise SpecificationError.at(phase.position, text)
     return NAMED.index(name)
 
 
-def _reached(behind: dict[str, set[str]], name: str) -> set[str]:
+def _reachable(behind: dict[str, set[str]], name: str) -> set[str]:
     found: set[str] = set()
     waiting = [name]
     while waiting:
@@ -59,7 +59,7 @@ def _reached(behind: dict[str, set[str]], name: str) -> set[str]:
     return found
 
 
-def ordered(names: Sequence[str], phases: Phases) -> list[int]:
+def evaluation_order(names: Sequence[str], phases: Phases) -> list[int]:
     places: dict[str, list[int]] = {}
     for place, name in enumerate(names):
         places.setdefault(name, []).append(place)
@@ -85,7 +85,7 @@ def unknown_phases(orders: Sequence[tree.OrderStatement], names: Sequence[str]) 
     for order in orders:
         for name in order.names:
             if name.parts[0] not in names:
-                text = f"no specification is named {shown(name.parts[0])}{nearest(name.parts[0], names)}"
+                text = f"no specification is named {quote(name.parts[0])}{nearest(name.parts[0], names)}"
                 yield Diagnostic(
                     name.position, "warning", f"{text}; `order` has no effect on it until one is loaded"
                 )
@@ -107,7 +107,7 @@ def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
             for node in tree.walk(event.action):
                 if isinstance(node, tree.CallStatement) and node.service == service:
                     text = f"calls {service}, and happens with each call of it: it calls without end;"
-                    text = f"{shown(event.name)} {text} call it from another event"
+                    text = f"{quote(event.name)} {text} call it from another event"
                     yield Diagnostic(node.position, "warning", text)
 
 
@@ -127,18 +127,18 @@ def _unlike_a_sender(specification: tree.Specification) -> Iterator[Diagnostic]:
 
 def _wrong_sender(function: str, text: str) -> str:
     if function == "caller" and text and not text.startswith("/"):
-        return f"the name of a node begins with `/`, so this is never equal; write {shown('/' + text)}"
+        return f"the name of a node begins with `/`, so this is never equal; write {quote('/' + text)}"
     if function != "host" or not text:
         return ""
     try:
         plain = str(ip_address(text))
     except ValueError:
         why = "`host` is an address such as 10.0.0.7, and never a name or a group"
-        return f"{why}, so this is never equal; write the address of {shown(text)}"
+        return f"{why}, so this is never equal; write the address of {quote(text)}"
     return (
         ""
         if plain == text
-        else f"`host` has this address as {shown(plain)}, so this is never equal; write that"
+        else f"`host` has this address as {quote(plain)}, so this is never equal; write that"
     )
 
 

@@ -9,7 +9,7 @@ from rosmop.form.compiled import Withholding
 from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import quote
 
 
 def withholdings(
@@ -18,13 +18,13 @@ def withholdings(
     found = []
     for node in specification.withholds:
         try:
-            found.append(_checked(names, specification, node))
+            found.append(_check(names, specification, node))
         except SpecificationError as error:
             shared.findings += error.findings
     return tuple(found)
 
 
-def _checked(
+def _check(
     names: SpecificationNames, specification: tree.Specification, node: tree.WithholdDeclaration
 ) -> Withholding:
     check_topic(node.topic, node.position)
@@ -46,7 +46,7 @@ def _checked(
     condition = node.condition.parts[0]
     variable = names.variables.get(condition)
     if variable is None or not isinstance(variable.type, value_types.BoolType) or variable.constant:
-        text = f"{shown(condition)} is not a `bool` variable of {names.name}"
+        text = f"{quote(condition)} is not a `bool` variable of {names.name}"
         raise SpecificationError.at(node.condition.position, f"{text}; declare `bool {condition} = true;`")
     variable.used = True
     return Withholding(node.topic, tuple(_networks(node)), variable.code)

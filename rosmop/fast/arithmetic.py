@@ -154,9 +154,9 @@ class FunctionBuilder(ABC):
     def _times(self, left: str, each: bytes, body: Sequence[nodes.Statement] = ()) -> bytes:
         over = self._get(left, I64) + I64_EQZ + br_if(1)
         less = self._get(left, I64) + constant(I64, 1) + I64_SUB + self._set(left, I64)
-        return self._repeated(over + less + each, body)
+        return self._repeat(over + less + each, body)
 
-    def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
+    def _repeat(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)
@@ -208,10 +208,10 @@ class ArithmeticCodegen(FunctionBuilder):
         if isinstance(source, value_types.FloatingType):
             return self._truncate(code + (F64_PROMOTE_F32 if one == F32 else b""), target)
         if one == other:
-            return code + _narrowed(target)
+            return code + _narrow(target)
         if other == I64:
             return code + (I64_EXTEND_I32_S if is_signed(source) else I64_EXTEND_I32_U)
-        return code + I32_WRAP_I64 + _narrowed(target)
+        return code + I32_WRAP_I64 + _narrow(target)
 
     def _truncate(self, code: bytes, target: value_types.IntegerType) -> bytes:
         if target.bits >= 32:
@@ -397,7 +397,7 @@ def to_floating(source: int, target: int, *, signed: bool) -> bytes:
     return _CONVERT[target, source, signed]
 
 
-def _narrowed(target: value_types.IntegerType) -> bytes:
+def _narrow(target: value_types.IntegerType) -> bytes:
     if target.bits >= 32:
         return b""
     if target.signed:

@@ -144,7 +144,7 @@ class WasmModule(CompiledModule):
     names: Sequence[Sequence[str]]
 
 
-def written(
+def write(
     functions: Mapping[str, nodes.Function],
     components: Sequence[nodes.Component],
     values: ValueCodec,
@@ -224,7 +224,7 @@ def written(
 
 def written_of(compiled: Compiled) -> WasmModule:
     components = [group.component for group in groups(compiled.specifications)]
-    return written(compiled.functions, components, ValueCodec(compiled.messages), compiled.stamped)
+    return write(compiled.functions, components, ValueCodec(compiled.messages), compiled.stamped)
 
 
 def _assemble(

@@ -9,9 +9,9 @@ from rosmop.certify.properties import DEFECT, certificates_of
 from rosmop.certify.steps import StepDiffersError, check_steps
 from rosmop.fast.abi import CompiledModule, SetPart
 from rosmop.fast.batch_codegen import WasmModule, written_of
-from rosmop.fast.load import loaded
-from rosmop.fast.serialization import decoded, encoded, encoded_part
-from rosmop.fast.wasm_instance import WasmError, translated
+from rosmop.fast.load import load_part
+from rosmop.fast.serialization import decode, encode, encoded_part
+from rosmop.fast.wasm_instance import WasmError, translate
 from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -25,7 +25,7 @@ class CertifiedSet(NamedTuple):
     data: bytes
 
 
-def certified(compiled: Compiled) -> CertifiedSet:
+def certify(compiled: Compiled) -> CertifiedSet:
     """Certify and serialize a set without its warnings; equal sets give equal bytes.
 
     Raises `SpecificationError` if an automaton differs from its formula, which is a defect.
@@ -33,14 +33,14 @@ def certified(compiled: Compiled) -> CertifiedSet:
     certificates, wrong = certificates_of(compiled.specifications)
     if wrong:
         raise SpecificationError(wrong)
-    return CertifiedSet(certificates, encoded(replace(compiled, warnings=())))
+    return CertifiedSet(certificates, encode(replace(compiled, warnings=())))
 
 
 def require_loadable(data: bytes) -> None:
     """Build and load the module as a relay does. Raises the errors of `parts_of`."""
     names = tuple(specification.name for specification in _set(data).specifications)
     for part in parts_of(data, [(names, ())]):
-        compiled, fast = loaded(part)
+        compiled, fast = load_part(part)
         MonitorSet.of(compiled, fast=fast)
 
 
@@ -58,7 +58,7 @@ def parts_of(data: bytes, wanted: Iterable[tuple[Collection[str], Collection[str
             raise SpecificationError(_defects(whole, names) or _defect(whole, names, error)) from error
 
 
-_set = lru_cache(maxsize=1)(decoded)
+_set = lru_cache(maxsize=1)(decode)
 
 
 @lru_cache(maxsize=1)  # a relay that has all specifications runs the part of `require_loadable`
@@ -101,7 +101,7 @@ def fast_path_of(compiled: Compiled) -> WasmFastPath:
 
 def _translate(module: WasmModule) -> CompiledModule:
     return CompiledModule(
-        code=translated(module.code, module.memory), memory=module.memory, frames=module.frames,
+        code=translate(module.code, module.memory), memory=module.memory, frames=module.frames,
         effects=module.effects, feeds=module.feeds, cells=module.cells, throttles=module.throttles,
         lines=module.lines, said=module.said, senders=module.senders,
     )  # fmt: skip

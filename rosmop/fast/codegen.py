@@ -19,7 +19,7 @@ from typing import Any
 
 from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells, is_kept, is_texts
 from rosmop.fast.arithmetic import in_seconds, to_floating
-from rosmop.fast.codegen_access import loaded, root_of
+from rosmop.fast.codegen_access import load_code, root_of
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine, is_text
 from rosmop.fast.memory_layout import LINES, MemoryLayout, NotCompiledError, is_signed, machine_type
 from rosmop.fast.strings_codegen import StringCodegen, moved_texts, settling
@@ -174,7 +174,7 @@ class ModuleCodegen(MemoryLayout):
     ) -> WasmFunction:
         key = (function.name, tuple(parameters), result, context, channel)
         if key not in self._numbers:
-            written = _FunctionCodegen(self, function, parameters, result, context, channel=channel).written()
+            written = _FunctionCodegen(self, function, parameters, result, context, channel=channel).write()
             self._numbers[key] = written
             self.written.append(written)
         return self._numbers[key]
@@ -183,7 +183,7 @@ class ModuleCodegen(MemoryLayout):
         self, key: tuple[object, ...], parameters: tuple[int, ...], write: Callable[[], bytes], result: int
     ) -> int:
         if key not in self._numbers:
-            self._numbers[key] = self._added(parameters, write(), result)
+            self._numbers[key] = self._add(parameters, write(), result)
         return self._numbers[key].number
 
     def routine_of(self, write: Callable[..., bytes]) -> int | None:
@@ -194,10 +194,10 @@ class ModuleCodegen(MemoryLayout):
         copy_texts = b""
         if any(is_texts(kind) for _, kind in cells.variables.values()):
             copy_texts = call(self.routine((moved_texts,), (I32, I32, I32), moved_texts, I32))
-        cells.settle = self._added((), settling(self, cells, copy_texts)).number
+        cells.settle = self._add((), settling(self, cells, copy_texts)).number
         return cells.settle
 
-    def _added(self, parameters: tuple[int, ...], code: bytes, result: int = I32) -> WasmFunction:
+    def _add(self, parameters: tuple[int, ...], code: bytes, result: int = I32) -> WasmFunction:
         written = WasmFunction(
             len(self.written), parameters, result, code, frozenset(), MessageEffects(), brief=True, passes=True,
         )  # fmt: skip
@@ -236,7 +236,7 @@ class _FunctionCodegen(StringCodegen):
         for name, _ in self._bits:
             self._local(name, I32)
 
-    def written(self) -> WasmFunction:
+    def write(self) -> WasmFunction:
         body = self._block(self._function.body)
         if isinstance(self._function, nodes.Skipper):
             body += self._position(self._function.end) + RETURN
@@ -304,7 +304,7 @@ class _FunctionCodegen(StringCodegen):
 
     def _loop(self, node: nodes.Loop) -> bytes:
         self._brief = False
-        return self._repeated(b"", node.body)
+        return self._repeat(b"", node.body)
 
     def _for_each(self, node: nodes.ForEach) -> bytes:
         kind, size = self._writer.element(node.values.type)
@@ -318,7 +318,7 @@ class _FunctionCodegen(StringCodegen):
         elif isinstance(kind, value_types.RecordType):
             each = self._get(at) + self._set(f"place of {node.name}")
         else:
-            each = loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
+            each = load_code(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
         following = self._get(at) + constant(I32, size) + I32_ADD + self._set(at)
         code = first + place + self._set(at) + count + self._set(left, I64)
         with self._apart(node.values):
@@ -588,7 +588,7 @@ class _FunctionCodegen(StringCodegen):
         )
         added = nodes.Convert(node.type, nodes.Arithmetic(node.wide, "+", one, other, node.site))
         span = nodes.Assign(node.type, total, added)
-        summed = loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
+        summed = load_code(self._get(at), 0, kind) + self._set(each, machine_type(kind))
         summed += self._evaluate(nodes.Evaluate(node.site, span))
         summed += self._get(at) + constant(I32, size) + I32_ADD + self._set(at)
         self._brief = False
@@ -620,7 +620,7 @@ class _FunctionCodegen(StringCodegen):
         at, left, each = (f"{what} {len(self._locals)}" for what in ("element", "left", "each"))
         code = place + limits[0] + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD + self._set(at)
         code += limits[1] + limits[0] + I64_SUB + self._set(left, I64) + self._spend(self._get(left, I64))
-        value = loaded(self._get(at), 0, kind)
+        value = load_code(self._get(at), 0, kind)
         value += to_floating(machine_type(kind), F64, signed=is_signed(kind)) + self._set(each, F64)
         value += self._get(each, F64) + self._get(least, F64) + self._get(each, F64) + self._get(least, F64)
         value += compare(F64, "<") + SELECT + self._set(least, F64)

@@ -107,7 +107,7 @@ class MessageAccess(ArithmeticCodegen):
         for name, kind, offset in node.fields:
             place = self._get("at")
             place += b"" if node.at.base is None else self._get(node.at.base, I64) + I32_WRAP_I64 + I32_ADD
-            code += loaded(place, node.at.offset + offset, kind) + self._set(name, machine_type(kind))
+            code += load_code(place, node.at.offset + offset, kind) + self._set(name, machine_type(kind))
         return code
 
     def _read_value(self, node: nodes.ReadValue) -> bytes:
@@ -145,7 +145,7 @@ class MessageAccess(ArithmeticCodegen):
         place = f"place of {node.name}"
         code = self._count(nodes.Count(node.site, count, node.at, 4))
         code += self._few(count, MAX_TEXTS) + self._get(count, I64) + self._set(left, I64)
-        code += self._taken(self._get(count, I64) + I32_WRAP_I64 + constant(I32, 4) + I32_MUL, place)
+        code += self._take(self._get(count, I64) + I32_WRAP_I64 + constant(I32, 4) + I32_MUL, place)
         code += (
             self._position(node.at.plus(4)) + self._set(node.end, I64) + self._get(place) + self._set(entry)
         )
@@ -160,7 +160,7 @@ class MessageAccess(ArithmeticCodegen):
     def _few(self, count: str, most: int) -> bytes:
         return self._when(self._get(count, I64) + constant(I64, most) + I64_GT_U, self._elsewhere)
 
-    def _taken(self, size: bytes, name: str) -> bytes:
+    def _take(self, size: bytes, name: str) -> bytes:
         """Take bytes (i32) of the arena, and name their address."""
         arena, taken = self._layout.arena(), f"taken {len(self._locals)}"
         code = load(I32, USED) + self._set(name) + self._get(name) + size + I32_ADD + self._set(taken)
@@ -181,7 +181,7 @@ class MessageAccess(ArithmeticCodegen):
             code = self._count(nodes.Count(node.site, count, node.at, self._layout.least(kind)))
             code += self._few(count, MAX_ROWS)
         place, row = f"place of {node.name}", constant(I32, self._layout.row(kind))
-        code += self._taken(self._get(count, I64) + I32_WRAP_I64 + row + I32_MUL, place)
+        code += self._take(self._get(count, I64) + I32_WRAP_I64 + row + I32_MUL, place)
         code += self._get(count, I64) + self._set(left, I64) + self._get(place) + self._set(entry)
         code += self._position(start) + self._set(node.end, I64)
         each = self._noted_row(node, kind, entry, 0) + self._get(entry) + row + I32_ADD + self._set(entry)
@@ -277,7 +277,7 @@ class MessageAccess(ArithmeticCodegen):
 
     def _place(self, node: nodes.Expression) -> tuple[bytes, bytes]:
         if isinstance(node, nodes.Copy):
-            self._layout.copied(node.type)
+            self._layout.require_free_copy(node.type)
             return self._place(node.value)
         if isinstance(node, nodes.Item):
             return self._place_of_field(node)
@@ -315,15 +315,15 @@ class MessageAccess(ArithmeticCodegen):
 
     def _element_at(self, node: nodes.Call) -> bytes:
         code = self._address_of(node) + self._set("element")
-        return code + loaded(self._get("element"), 0, node.type)
+        return code + load_code(self._get("element"), 0, node.type)
 
     def _item(self, node: nodes.Item) -> bytes:
         machine_type(node.type)
         first, place = self._place_of_field(node)
-        return first + loaded(place, 0, node.type)
+        return first + load_code(place, 0, node.type)
 
 
-def loaded(place: bytes, offset: int, kind: Type) -> bytes:
+def load_code(place: bytes, offset: int, kind: Type) -> bytes:
     codes = struct_code(kind) or ""
     if len(codes) == 2:
         extend = I64_EXTEND_I32_U if codes[0] == "I" else I64_EXTEND_I32_S

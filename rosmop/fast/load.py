@@ -11,7 +11,7 @@ def prepare() -> None:
     load()
 
 
-def loaded(data: bytes) -> tuple[Compiled, WasmFastPath]:
+def load_part(data: bytes) -> tuple[Compiled, WasmFastPath]:
     """Load a part, or the empty set without data. Raises `ValueError` for other data."""
     part = decoded_part(data) if data else SetPart.empty()
     return part.compiled, WasmFastPath(part.module)

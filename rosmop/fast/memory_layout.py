@@ -157,11 +157,11 @@ class MemoryLayout:
             return kind.element, self.row(kind.element)
         return kind.element, self.size(kind.element)
 
-    def copied(self, kind: Type) -> Type:
+    def require_free_copy(self, kind: Type) -> Type:
         """Return the type. Raises `NotCompiledError` if a copy of its values is not free."""
         if isinstance(kind, value_types.RecordType):
             for field in self._values.fields(kind):
-                self.copied(field)
+                self.require_free_copy(field)
         elif struct_code(kind) is None:
             raise NotCompiledError.of(kind)
         return kind

@@ -38,7 +38,7 @@ def _plain(value: object) -> object:
     raise NotImplementedError(type(value).__name__)
 
 
-def _made(kind: type, value: object) -> object:
+def _make(kind: type, value: object) -> object:
     if kind is CompiledProperty:
         logic, number, parts = msgspec.convert(value, tuple[str, int, Any])
         if logic not in LOGICS or not 0 <= number < len(LOGICS[logic].properties):
@@ -52,10 +52,10 @@ def _made(kind: type, value: object) -> object:
 
 
 _PARTS = msgspec.msgpack.Decoder(tuple[msgspec.Raw, CompiledModule])
-_DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
+_DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_make)
 
 
-def encoded(compiled: Compiled) -> bytes:
+def encode(compiled: Compiled) -> bytes:
     definitions = compiled.messages.definitions
     reached = {name for specification in compiled.specifications for name in specification.reached}
     reached |= {publication.type for publication in compiled.publications}
@@ -74,12 +74,12 @@ def encoded(compiled: Compiled) -> bytes:
     return msgspec.msgpack.encode(compiled, enc_hook=plain, order="deterministic")
 
 
-def decoded(data: bytes) -> Compiled:
+def decode(data: bytes) -> Compiled:
     return _DECODER.decode(data)
 
 
 def encoded_part(part: SetPart) -> bytes:
-    return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
+    return msgspec.msgpack.encode((msgspec.Raw(encode(part.compiled)), part.module))
 
 
 def decoded_part(data: bytes) -> SetPart:

@@ -141,7 +141,7 @@ class StringCodegen(MessageAccess):
                 f"copy {len(self._locals)}",
                 count + I32_WRAP_I64 + constant(I32, kept_size(node.type)) + I32_MUL,
             )
-            code += self._taken(size, copy) + self._get(copy) + place + size + MEMORY_COPY
+            code += self._take(size, copy) + self._get(copy) + place + size + MEMORY_COPY
             place = self._get(copy)
         self._assigned.add(node.name)
         return code + store(I32, at, place) + store(I32, at + 4, count + I32_WRAP_I64)
@@ -171,12 +171,12 @@ class StringCodegen(MessageAccess):
         mine = load(I32, at) + constant(I32, arena) + load(I32, MARK) + I32_ADD + I32_GE_U
         mine += load(I32, at) + constant(I32, arena + ARENA) + I32_LT_U + I32_AND
 
-        def copied() -> bytes:
+        def copy_code() -> bytes:
             length = count + I32_WRAP_I64 + constant(I32, size) + I32_MUL
-            made = self._taken(length, copy) + self._get(copy) + place + length + MEMORY_COPY
+            made = self._take(length, copy) + self._get(copy) + place + length + MEMORY_COPY
             return made + store(I32, at, self._get(copy))
 
-        code += self._when(mine + I32_EQZ, copied)
+        code += self._when(mine + I32_EQZ, copy_code)
         self._assigned.add(vector.name)
         element = (
             load(I32, at) + self._get(where, I64) + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD
@@ -252,15 +252,15 @@ def turns(leave: bytes, *turn: bytes) -> bytes:
 def mismatch() -> bytes:
     one, other, size, at = (local_get(local) for local in range(4))
 
-    def compared(read: bytes, differs: bytes) -> bytes:
+    def compare(read: bytes, differs: bytes) -> bytes:
         return one + at + I32_ADD + read + other + at + I32_ADD + read + differs + br_if(1)
 
     def on(more: int) -> bytes:
         return at + constant(I32, more) + I32_ADD + local_set(3)
 
     few = size + at + I32_SUB + constant(I32, 8) + I32_LT_U
-    long = turns(few, compared(i64_load(0), I64_NE), on(8))
-    short = turns(at + size + I32_EQ, compared(i32_load8_u(0), I32_NE), on(1))
+    long = turns(few, compare(i64_load(0), I64_NE), on(8))
+    short = turns(at + size + I32_EQ, compare(i32_load8_u(0), I32_NE), on(1))
     return function([(1, I32)], long + short + at)
 
 

@@ -3,7 +3,7 @@
 - Work is bounded by *fuel*: about one unit for each instruction or copied byte, the same on every machine.
 - Addresses for the whole limit are reserved at the start, and the memory grows in place. So an older view stays
   valid, only shorter, and keeps the memory alive after the instance is closed.
-- One process translates a module into machine code (`translated`). Others run it and compile nothing.
+- One process translates a module into machine code (`translate`). Others run it and compile nothing.
 - The library `wasmtime` is called through its C functions (0.4 µs a call, instead of 20 µs through its Python code).
   Calls hold Python's lock, so no other thread runs in an instance. The relay cannot load wasmtime's Python code: it
   has functions that C calls, for which libffi needs memory that is writable and executable. For the same reason a
@@ -54,7 +54,7 @@ class WasmTrap(Exception):  # noqa: N818  its name in WebAssembly
 class WasmInstance:
     """A module, which has no imports, and the memory that it exports as `memory`, of at most `limit` bytes.
 
-    `code` must be the result of `translated` with the same `limit`, because it is run unchecked. Raises `WasmError`,
+    `code` must be the result of `translate` with the same `limit`, because it is run unchecked. Raises `WasmError`,
     and `WasmTrap` if the module's start traps.
     """
 
@@ -75,7 +75,7 @@ class WasmInstance:
         finally:
             c.wasmtime_module_delete(module)
         if trap:
-            raise _trapped(trap)
+            raise _to_trap(trap)
         name, length, export = ctypes.c_void_p(), ctypes.c_size_t(), _Export()
         for number in count():
             out = (ctypes.byref(slot) for slot in (name, length, export))
@@ -83,7 +83,7 @@ class WasmInstance:
                 break
             text = ctypes.string_at(name.value or 0, length.value).decode()
             if export.kind == _FUNCTION:
-                call = _bound(store, export)
+                call = _bind(store, export)
                 if call is not None:
                     self._natives[text] = _addresses(store, export)
                     self._functions[len(self._functions) // 2] = self._functions[text] = call
@@ -199,7 +199,7 @@ _C: dict[str, tuple[Any, ...]] = {  # the result and the parameters of each func
 }
 
 
-def translated(code: bytes, limit: int) -> bytes:
+def translate(code: bytes, limit: int) -> bytes:
     """Translate a module into machine code for a `WasmInstance` with this limit. The result is deterministic.
 
     Raises `WasmError` if the code is not a module.
@@ -257,7 +257,7 @@ def _engine(bits: int) -> int:
     return engine
 
 
-def _bound(store: _Store, export: _Export) -> Call | None:
+def _bind(store: _Store, export: _Export) -> Call | None:
     """Return a callable for an export, or None if it has arguments or results other than integers.
 
     Arguments and result are in slots of 16 bytes. The wrapper must free a returned trap or error.
@@ -293,7 +293,7 @@ def _bound(store: _Store, export: _Export) -> Call | None:
         if error is not None:
             _check(error)
         if trap:
-            raise _trapped(trap)
+            raise _to_trap(trap)
         return read[0]
 
     return call
@@ -310,7 +310,7 @@ def failure(error: int, trap: int) -> Exception:
         _check(error or None)
     except WasmError as found:
         return found
-    return _trapped(ctypes.c_void_p(trap))
+    return _to_trap(ctypes.c_void_p(trap))
 
 
 def _kinds(vector: Any) -> list[Any]:
@@ -328,7 +328,7 @@ def _check(error: int | None) -> None:
         raise WasmError(message)
 
 
-def _trapped(trap: ctypes.c_void_p) -> WasmTrap:
+def _to_trap(trap: ctypes.c_void_p) -> WasmTrap:
     c, code = load(), ctypes.c_uint8()
     c.wasmtime_trap_code(trap, ctypes.byref(code))
     c.wasm_trap_delete(trap)

@@ -134,20 +134,20 @@ class ModuleState:
             self._enter()
         self.prepared = prepared
         self.machine.refuel(FUEL)
-        self._memory[self._source : self._source + _PREPARED.size] = packed(prepared)
+        self._memory[self._source : self._source + _PREPARED.size] = pack_options(prepared)
         if not self._senders or (names := self._turn.names(prepared.source)) == self._named:
             return
         self._named = names
         for address in self._senders:
             room = address + _SPANS.size
             words = [
-                entered(self._memory, name, room + place * MAX_KEPT, value_types.STRING)
+                put_value(self._memory, name, room + place * MAX_KEPT, value_types.STRING)
                 for place, name in enumerate(names)
             ]
             _SPANS.pack_into(self._memory, address, *words)
 
     def _unprepare(self) -> None:
-        """Note that the memory differs from the `packed` form of all options."""
+        """Note that the memory differs from what `pack_options` makes of all options."""
         self.prepared = None
         _PREPARED.pack_into(self._memory, self._source, *[-1] * 4)
 
@@ -157,7 +157,7 @@ class ModuleState:
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
         for place, buffer, kind in self._strings:
-            values[place] = entered(self._memory, values[place], buffer, kind)
+            values[place] = put_value(self._memory, values[place], buffer, kind)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
@@ -193,7 +193,7 @@ class ModuleState:
         self.leave()
         self._due(anew=True)
 
-    def named(self, context: str) -> str:
+    def monitor_of(self, context: str) -> str:
         return self._contexts[context].monitor
 
     def leave(self) -> None:
@@ -219,16 +219,16 @@ class ModuleState:
         found = dict(zip(self._names, values[len(self._running) :], strict=True))
         for place, _, kind in self._strings:
             name = self._names[place]
-            found[name] = left(self._memory, found[name], self._values[name], kind)
+            found[name] = take_value(self._memory, found[name], self._values[name], kind)
         self._values.update(found)
 
 
-def packed(prepared: BatchOptions) -> bytes:
+def pack_options(prepared: BatchOptions) -> bytes:
     sender = prepared.source << 32
     return _PREPARED.pack(sender, prepared.told, prepared.enabled, prepared.counted)
 
 
-def entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
+def put_value(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     if len(value) > most_kept(kind):
         return BEYOND << 32
     if is_texts(kind):
@@ -248,7 +248,7 @@ def entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     return buffer | len(value) << 32
 
 
-def left(memory: memoryview, word: int, before: Value, kind: Type) -> Value:
+def take_value(memory: memoryview, word: int, before: Value, kind: Type) -> Value:
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
         return before
@@ -288,7 +288,7 @@ class WasmLane:
         self.monitors = tuple(monitor.name for monitor in monitors)
         self.drops = feed.drops
         self.changes = feed.changes
-        self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
+        self._lines = [(line, home.monitor_of(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
         self._monitors = tuple(dict.fromkeys(monitors))
         self._sources = [(one, one.sources[topic]) for one in self._monitors if topic in one.sources]
@@ -313,7 +313,7 @@ class WasmLane:
     def writers(self, who: int) -> tuple[str, ...]:
         return tuple(name for number, (name,) in enumerate(self.events) if who >> number & 1)
 
-    def happened(self) -> Sequence[int]:
+    def take_events(self) -> Sequence[int]:
         counts: Sequence[int] = self._counts.unpack_from(self._memory, self._feed.counters)
         self._counts.pack_into(self._memory, self._feed.counters, *self._none)
         return counts
@@ -415,7 +415,7 @@ class WasmLane:
             self._home.options,
             cells,
             self._home,
-            packed,
+            pack_options,
             failure,
             keeps,
         )
@@ -454,7 +454,7 @@ class WasmLane:
         if not walked.position:
             return None
         outcome = Outcome(message, time_ns)
-        happened = zip(self.events, self.happened(), strict=True)
+        happened = zip(self.events, self.take_events(), strict=True)
         outcome.events = tuple([name for (name,), count in happened if count])
         for who in prepared.changed:
             outcome.result, outcome.buffer, outcome.changed_by = (
@@ -472,7 +472,7 @@ class WasmLane:
     ) -> Outcome | None:
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor in judging)
         prepared = self.prepare(loud=True, told=[True] * len(self.events), source=source)
-        earlier = self.happened()  # of batches, which are counted later
+        earlier = self.take_events()  # of batches, which are counted later
         area = self._memory[self._frames : self._frames + min(4 + len(message), AREA)]
         kept = bytes(area) if self._holds(message) else b""  # other frames of its batch
         try:

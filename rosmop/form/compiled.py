@@ -20,11 +20,11 @@ def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
     """Group specifications; `uses` maps each to those whose variables it uses."""
     names = list(uses)
     return [
-        {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
+        {names[number] for number in group} for group in components([(name, *uses[name]) for name in names])
     ]
 
 
-def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
+def components(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
     owners: dict[object, int] = {}
     chief = list(range(len(keys)))
 
@@ -138,7 +138,7 @@ class Given:
         )
         return fits and self.bounds[0] <= value <= self.bounds[1]  # type: ignore[operator]  # a number
 
-    def held(self, value: Any) -> bool | int | float:
+    def to_type(self, value: Any) -> bool | int | float:
         if not isinstance(self.type, value_types.FloatingType):
             return value  # type: ignore[no-any-return]  # a number
         return float(value) if self.type.bits == 64 else struct.unpack("<f", struct.pack("<f", value))[0]
@@ -252,11 +252,11 @@ class Compiled:
         return replace(
             part,
             specifications=tuple(
-                replace(one, safes=nodes.moved(one.safes, numbers)) if one.safes else one
+                replace(one, safes=nodes.with_sites(one.safes, numbers)) if one.safes else one
                 for one in part.specifications
             ),
             warnings=(),
-            functions={name: nodes.moved(function, numbers) for name, function in functions.items()},
+            functions={name: nodes.with_sites(function, numbers) for name, function in functions.items()},
             sites=[self.sites[site] for site in sites],
             types={name: kind for name, kind in self.types.items() if Symbols.owner(name) in names},
         )

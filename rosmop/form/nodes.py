@@ -702,13 +702,13 @@ def sites_of(root: object) -> set[int]:
     return {site for site in found if site != -1}
 
 
-def moved(root: Any, sites: Mapping[int, int]) -> Any:
+def with_sites(root: Any, sites: Mapping[int, int]) -> Any:
     if isinstance(root, tuple):
-        return tuple(moved(part, sites) for part in root)
+        return tuple(with_sites(part, sites) for part in root)
     if not isinstance(root, FormNode):
         return root
     parts = msgspec.structs.asdict(root).items()
-    return type(root)(*(sites[part] if name == _SITE else moved(part, sites) for name, part in parts))
+    return type(root)(*(sites[part] if name == _SITE else with_sites(part, sites) for name, part in parts))
 
 
 PURE = "lib"

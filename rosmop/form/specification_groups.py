@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rosmop.form import nodes
-from rosmop.form.compiled import SpecificationCode, connected
+from rosmop.form.compiled import SpecificationCode, components
 from rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 
@@ -23,7 +23,7 @@ class SpecificationGroup:
 
 
 def groups(specifications: Sequence[SpecificationCode]) -> Iterator[SpecificationGroup]:
-    found = connected([
+    found = components([
         [
             specification.name,
             *specification.uses,

@@ -51,11 +51,11 @@ def literal(value: object) -> str | None:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return f'"{quoted(value)}"' if _PRINTABLE.match(value) else None
+        return f'"{quote(value)}"' if _PRINTABLE.match(value) else None
     return number(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     return "".join(_ESCAPES.get(letter, letter) for letter in text)
 
 
@@ -65,8 +65,8 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
 
 
-def formatted(text: str) -> str:
-    return quoted(text).replace("%", "%%")
+def escape(text: str) -> str:
+    return quote(text).replace("%", "%%")
 
 
 def identifier(text: str) -> str:
@@ -358,7 +358,7 @@ class _Proposer:
     def _set(
         self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
-        texts = [literal(value) for value in values.ordered]
+        texts = [literal(value) for value in values.sorted_values]
         if not values.closed or None in texts:
             return
         if self._known.fields[topic][path] == "bool" and len(texts) == 2:  # `bool` has no other values
@@ -376,7 +376,7 @@ class _Proposer:
         self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
         moves = content.moves.get(path, {})
-        ordered = values.ordered
+        ordered = values.sorted_values
         count = len(ordered)
         if count < 3 or len(moves) >= count * (count - 1) or min(moves.values(), default=0) < 3:
             return

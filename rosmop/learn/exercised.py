@@ -38,18 +38,18 @@ class CoverageItem:
 def items_of(texts: Mapping[str, str]) -> list[CoverageItem]:
     """Return the items in their order. Raises `SpecificationError`."""
     try:
-        return _items(_marked(texts))
+        return _items(_mark(texts))
     except FormulaError as error:
         raise SpecificationError(error.findings) from error
 
 
-def covered(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
+def coverage(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
     """Return the counts in the order of `items_of`. Raises `SpecificationError`.
 
     A state counts the events that entered it or stayed in it.
     """
     compiled_from(texts, definitions)  # reports errors for the unchanged text
-    marked = _marked(texts)
+    marked = _mark(texts)
     counts: Counter[CoverageItem] = Counter()
     monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
     # explaining a verdict makes test runs, which are not part of the recording
@@ -65,15 +65,15 @@ def covered(texts: Mapping[str, str], definitions: Definitions, recording: Recor
             if item.specification == monitor.name:
                 counts[item] += monitors.value(monitor.name, name)
     for watch in watches:
-        counts.update(watch.seen())
+        counts.update(watch.counts())
     return [counts[item] for item in _items(marked)]
 
 
-def merged(one: Sequence[int], other: Sequence[int]) -> list[int]:
+def add_counts(one: Sequence[int], other: Sequence[int]) -> list[int]:
     return [a + b for a, b in zip(one, other, strict=True)]
 
 
-def _marked(texts: Mapping[str, str]) -> "_Marked":
+def _mark(texts: Mapping[str, str]) -> "_Marked":
     return _Marked([parse(text, name) for name, text in texts.items()])
 
 
@@ -198,7 +198,7 @@ class _Watch(CompiledProperty):
         states = read_state_machine(self.source, timed=self._machine.timed).states
         return _Run(self, self._machine.start(time_ns), next(iter(states)))
 
-    def seen(self) -> dict[CoverageItem, int]:
+    def counts(self) -> dict[CoverageItem, int]:
         counts: Counter[CoverageItem] = Counter()
         states = read_state_machine(self.source, timed=self.timed).states
         for (state, event), count in self.taken.items():
@@ -240,7 +240,7 @@ class _Run:
         self._state = categories[1] if len(categories) > 1 else self._state
         return categories
 
-    def saved(self) -> tuple[()]:
+    def save(self) -> tuple[()]:
         return ()
 
     def restore(self, saved: tuple[()]) -> None: ...

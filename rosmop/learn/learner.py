@@ -23,7 +23,7 @@ from rosmop.learn.candidates import (
     Candidate,
     CandidateSupport,
     LearntFacts,
-    formatted,
+    escape,
     identifier,
     number,
     one_line,
@@ -162,7 +162,7 @@ def _alarm(condition: str, statements: Sequence[str]) -> list[str]:
 
 
 def _warning(row: Candidate, names: Mapping[str, str]) -> str:
-    text = f"{formatted(row.topic)} {formatted(row.says)}"
+    text = f"{escape(row.topic)} {escape(row.says)}"
     if not row.shown:
         return f'ROS_WARN_THROTTLE({_TOLD_EVERY}, "{text}");'
     (shown,) = _fill(row, (row.shown,), names)
@@ -236,7 +236,7 @@ class LearningResult:
         return "".join(self.texts)
 
 
-def packed(pieces: Iterable[str]) -> tuple[str, ...]:
+def pack(pieces: Iterable[str]) -> tuple[str, ...]:
     """Return as few texts as fit in files, with these pieces in their order."""
     texts = [""]
     for piece in pieces:
@@ -305,7 +305,7 @@ class _Learner:
             )
         rows = list(specifications(kept, whole))
         names = {candidate.key: name for name, _, group in rows for candidate in group}
-        texts = packed([*self._head(whole, kept, left_out), *(f"\n{row[1]}" for row in rows)])
+        texts = pack([*self._head(whole, kept, left_out), *(f"\n{row[1]}" for row in rows)])
         compiled_from(named_files(texts), self._definitions)
         return LearningResult(
             texts,
@@ -374,12 +374,12 @@ class _Learner:
             if isinstance(facts, LearningError):
                 self._failed[step.recording] = str(facts)
             elif step.first_window < len(self._trained) * self._each:
-                trained = trained.merged(facts)
+                trained = trained.merge(facts)
             else:
-                held_out = held_out.merged(facts)
+                held_out = held_out.merge(facts)
         if self._failed.keys() >= {part.number for part in self._trained}:
             raise LearningError(next(iter(self._failed.values())))
-        return trained, trained.merged(held_out)
+        return trained, trained.merge(held_out)
 
     def _alarms(self, candidates: Sequence[Candidate], known: LearntFacts) -> AlarmFacts:
         rows = list(specifications(candidates, known))
@@ -388,7 +388,7 @@ class _Learner:
             name: [(numbers[candidate.key], f"{candidate.topic} {candidate.says}") for candidate in group]
             for name, _, group in rows
         }
-        texts = packed(f"\n{row[1]}" for row in rows)
+        texts = pack(f"\n{row[1]}" for row in rows)
         held_out = range(len(self._trained), len(self._parts))
         steps = [AlarmStep(*self._span(place), texts=texts, says=says) for place in held_out]
         alarms: AlarmFacts = self._pass(steps, AlarmFacts())[1]

@@ -68,8 +68,8 @@ class TimeFacts(msgspec.Struct, frozen=True, tag=True):
 
     rhythms: dict[str, TopicRhythm] = {}
 
-    def merged(self, other: "TimeFacts") -> "TimeFacts":
-        return TimeFacts(merged_rows(self.rhythms, other.rhythms, TopicRhythm.merged))
+    def merge(self, other: "TimeFacts") -> "TimeFacts":
+        return TimeFacts(merged_rows(self.rhythms, other.rhythms, TopicRhythm.merge))
 
 
 class ContentFacts(msgspec.Struct, frozen=True, tag=True):
@@ -78,10 +78,10 @@ class ContentFacts(msgspec.Struct, frozen=True, tag=True):
     contents: dict[str, TopicContent] = {}
     pairs: dict[tuple[str, str], TopicPair] = {}
 
-    def merged(self, other: "ContentFacts") -> "ContentFacts":
+    def merge(self, other: "ContentFacts") -> "ContentFacts":
         return ContentFacts(
-            merged_rows(self.contents, other.contents, TopicContent.merged),
-            merged_rows(self.pairs, other.pairs, TopicPair.merged),
+            merged_rows(self.contents, other.contents, TopicContent.merge),
+            merged_rows(self.pairs, other.pairs, TopicPair.merge),
         )
 
 
@@ -90,7 +90,7 @@ class AlarmFacts(msgspec.Struct, frozen=True, tag=True):
 
     alarms: dict[int, int] = {}
 
-    def merged(self, other: "AlarmFacts") -> "AlarmFacts":
+    def merge(self, other: "AlarmFacts") -> "AlarmFacts":
         return AlarmFacts(merged_rows(self.alarms, other.alarms, int.__add__))
 
 
@@ -131,7 +131,7 @@ def _contents(step: ContentStep, source: RecordingSource, definitions: Definitio
             text = f"{source.name}: a message on {topic} is not of type {step.topics[topic]}: {error}"
             raise LearningError(text) from error
         orders.add(topic, time, window)
-    return ContentFacts({topic: content.ended() for topic, content in contents.items()}, orders.ended())
+    return ContentFacts({topic: content.finish() for topic, content in contents.items()}, orders.finish())
 
 
 def _alarms(step: AlarmStep, source: RecordingSource, definitions: Definitions) -> AlarmFacts:

@@ -35,7 +35,7 @@ class HighestValues(msgspec.Struct):
         if value > self.of.get(window, -math.inf):
             self.of[window] = value
 
-    def merged(self, other: "HighestValues") -> "HighestValues":
+    def merge(self, other: "HighestValues") -> "HighestValues":
         return HighestValues(merged_rows(self.of, other.of, max))
 
     @property
@@ -60,7 +60,7 @@ class ValueSeries(msgspec.Struct):
     def end(self) -> None:
         self.last = {}
 
-    def merged(self, other: "ValueSeries") -> "ValueSeries":
+    def merge(self, other: "ValueSeries") -> "ValueSeries":
         result = ValueSeries(
             merged_rows(self.windows, other.windows, int.__add__), many=self.many or other.many
         )
@@ -68,7 +68,7 @@ class ValueSeries(msgspec.Struct):
         return result
 
     @property
-    def ordered(self) -> list[Any]:
+    def sorted_values(self) -> list[Any]:
         return sorted(self.windows, key=lambda value: (isinstance(value, bytes), value))
 
     def _limit(self) -> None:
@@ -109,11 +109,11 @@ class Series(msgspec.Struct):
         self.last, self.time, self.since = None, 0.0, 0.0
         self.values.end()
 
-    def merged(self, other: "Series") -> "Series":
+    def merge(self, other: "Series") -> "Series":
         return Series(
             self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
-            self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),
-            self.values.merged(other.values), self.rates.merged(other.rates), self.stays.merged(other.stays),
+            self.infinite or other.infinite, self.highs.merge(other.highs), self.lows.merge(other.lows),
+            self.values.merge(other.values), self.rates.merge(other.rates), self.stays.merge(other.stays),
         )  # fmt: skip
 
     def add(self, value: float | int, seconds: float, window: int) -> None:

@@ -35,9 +35,9 @@ class TopicPair(msgspec.Struct):
         self.first = self.last = None
         self.seconds, self.started = 0, False
 
-    def merged(self, other: "TopicPair") -> "TopicPair":
+    def merge(self, other: "TopicPair") -> "TopicPair":
         return TopicPair(
-            self.back.merged(other.back), self.forth.merged(other.forth), self.answered + other.answered,
+            self.back.merge(other.back), self.forth.merge(other.forth), self.answered + other.answered,
             self.requires and other.requires, self.turns and other.turns,
         )  # fmt: skip
 
@@ -74,7 +74,7 @@ class TopicOrders:
         self.pairs = {(a, b): TopicPair() for a in self.names for b in self.names if a != b}
 
     def add_recordings(self, pairs: Mapping[tuple[str, str], TopicPair]) -> None:
-        self.pairs = merged_rows(self.pairs, pairs, TopicPair.merged)
+        self.pairs = merged_rows(self.pairs, pairs, TopicPair.merge)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:
         """Whether `count` messages would be within `bound` seconds of another topic's (`rate`, 1/s) by chance alone."""
@@ -96,7 +96,7 @@ class TopicOrderReader:
         for pair in self._firsts.get(topic, ()):
             pair.add_first(time)
 
-    def ended(self) -> dict[tuple[str, str], TopicPair]:
+    def finish(self) -> dict[tuple[str, str], TopicPair]:
         for pair in self.pairs.values():
             pair.end()
         return self.pairs

@@ -42,9 +42,9 @@ class TopicRhythm(msgspec.Struct):
     def end(self) -> None:
         self.last = None
 
-    def merged(self, other: "TopicRhythm") -> "TopicRhythm":
+    def merge(self, other: "TopicRhythm") -> "TopicRhythm":
         return TopicRhythm(
-            self.count + other.count, self.recordings | other.recordings, self.gaps.merged(other.gaps),
+            self.count + other.count, self.recordings | other.recordings, self.gaps.merge(other.gaps),
             {**self.some, **other.some},
         )  # fmt: skip
 
@@ -75,14 +75,14 @@ class TopicContent(msgspec.Struct):
     counts: HighestValues = msgspec.field(default_factory=HighestValues)
     backward: bool = False
 
-    def merged(self, other: "TopicContent") -> "TopicContent":
+    def merge(self, other: "TopicContent") -> "TopicContent":
         result = TopicContent(
-            merged_rows(self.numbers, other.numbers, Series.merged),
+            merged_rows(self.numbers, other.numbers, Series.merge),
             merged_rows(self.elements, other.elements, _merge_elements),
-            merged_rows(self.sets, other.sets, ValueSeries.merged),
-            merged_rows(self.lengths, other.lengths, ValueSeries.merged),
+            merged_rows(self.sets, other.sets, ValueSeries.merge),
+            merged_rows(self.lengths, other.lengths, ValueSeries.merge),
             merged_rows(self.moves, other.moves, _merge_moves),
-            self.ages.merged(other.ages), self.leads.merged(other.leads), self.counts.merged(other.counts),
+            self.ages.merge(other.ages), self.leads.merge(other.leads), self.counts.merge(other.counts),
             self.backward or other.backward,
         )  # fmt: skip
         result.limit()
@@ -100,7 +100,7 @@ class TopicContent(msgspec.Struct):
 
 def _merge_elements(one: list[Series], other: list[Series]) -> list[Series]:
     # Arrays of different lengths are left out afterwards, by `limit`.
-    return [a.merged(b) for a, b in zip(one, other, strict=False)]
+    return [a.merge(b) for a, b in zip(one, other, strict=False)]
 
 
 def _merge_moves(one: Moves, other: Moves) -> Moves:
@@ -121,7 +121,7 @@ class TopicContentReader:
         self._stamp = -1.0
         self._opened, self._counted = 0.0, 0
 
-    def ended(self) -> TopicContent:
+    def finish(self) -> TopicContent:
         content = self.content
         for series in [
             *content.numbers.values(),

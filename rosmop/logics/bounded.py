@@ -56,9 +56,9 @@ class FormulaCell:
 
     def touch(self) -> None:
         if self not in self.journal:
-            self.journal[self] = self.saved()
+            self.journal[self] = self.save()
 
-    def saved(self) -> "_CellState":
+    def save(self) -> "_CellState":
         return self.kind, self.missing, self.operands, self.tells, [*self.users], self.value
 
     def restore(self, saved: "_CellState") -> None:
@@ -130,7 +130,7 @@ class _Row:
     right: Value | None
     cell: FormulaCell | None
 
-    def saved(self) -> tuple[int, int, Value | None, Value | None, FormulaCell | None]:
+    def save(self) -> tuple[int, int, Value | None, Value | None, FormulaCell | None]:
         return self.place, self.time, self.left, self.right, self.cell
 
     def restore(self, saved: tuple[int, int, Value | None, Value | None, FormulaCell | None]) -> None:
@@ -167,7 +167,7 @@ class _Operator(ABC):
     def deadline(self) -> int | None:
         return None
 
-    def saved(self) -> tuple[object, ...]:
+    def save(self) -> tuple[object, ...]:
         return (self.rows,)
 
     def restore(self, saved: tuple[Any, ...]) -> None:
@@ -351,7 +351,7 @@ class _OpenUntil(_Rows):
             del self.pending[following]
         return self.pending[following][0] + self.high if following < len(self.pending) else None
 
-    def saved(self) -> tuple[object, ...]:
+    def save(self) -> tuple[object, ...]:
         return (
             self.rows, self.passed, self.pending, self.holds, self.hopes, self.fails, self.doubts, self.waits,
         )  # fmt: skip
@@ -419,7 +419,7 @@ class _OpenSince(_Rows):
                 break
             self.window.step(left, right, self.drop().time)
 
-    def saved(self) -> tuple[deque[_Row], SinceWindow, SinceWindow, SinceWindow]:
+    def save(self) -> tuple[deque[_Row], SinceWindow, SinceWindow, SinceWindow]:
         return self.rows, self.window, self.least, self.most
 
     def restore(self, saved: tuple[deque[_Row], SinceWindow, SinceWindow, SinceWindow]) -> None:
@@ -438,7 +438,7 @@ class _OpenPreviously(_Operator):
         self.before, self.time = self.run.value(self.left), now
         _use(self.before, self)
 
-    def saved(self) -> tuple[deque[_Row], Value, int]:
+    def save(self) -> tuple[deque[_Row], Value, int]:
         return self.rows, self.before, self.time
 
     def restore(self, saved: tuple[deque[_Row], Value, int]) -> None:
@@ -472,7 +472,7 @@ class _Next(_Operator):
     def deadline(self) -> int | None:
         return next((row.time + self.high for row in self.before if _wanted(row)), None)
 
-    def saved(self) -> tuple[deque[_Row], deque[_Row]]:
+    def save(self) -> tuple[deque[_Row], deque[_Row]]:
         return self.rows, self.before
 
     def restore(self, saved: tuple[deque[_Row], deque[_Row]]) -> None:
@@ -630,7 +630,7 @@ class BoundedRun(CostlyRun):
     def mark(self) -> "_RunMark":
         self.journal.clear()
         operators = [
-            tuple(copy(value) if isinstance(value, _CONTAINERS) else value for value in operator.saved())
+            tuple(copy(value) if isinstance(value, _CONTAINERS) else value for value in operator.save())
             for operator in self.operators.values()
         ]
         return self.place, list(map(copy, self._at_once)), operators
@@ -643,7 +643,7 @@ class BoundedRun(CostlyRun):
             cell.restore(noted)
         self.journal.clear()
 
-    def saved(self) -> tuple[list[Any], int, int, dict[bool, int], dict[bool, int]]:
+    def save(self) -> tuple[list[Any], int, int, dict[bool, int], dict[bool, int]]:
         return self._at_once, self.place, self._now, self._told, self._about
 
     def restore(self, saved: tuple[list[Any], int, int, dict[bool, int], dict[bool, int]]) -> None:

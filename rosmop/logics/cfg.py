@@ -59,7 +59,7 @@ class GrammarRun(UntimedRun, CostlyRun):
         self.frame, accepted = after
         return MATCH if accepted else UNDECIDED
 
-    def saved(self) -> tuple[EarleySet | None]:
+    def save(self) -> tuple[EarleySet | None]:
         return (self.frame,)
 
     def restore(self, saved: tuple[EarleySet | None]) -> None:

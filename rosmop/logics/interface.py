@@ -54,7 +54,7 @@ class Run(Protocol):
     def expire(self) -> Categories:
         """Call this only while ``deadline`` is not None."""
 
-    def saved(self) -> tuple[object, ...]:
+    def save(self) -> tuple[object, ...]:
         """Return the values that change (`state_of_runs.py`)."""
 
     def restore(self, saved: tuple[Any, ...]) -> None:
@@ -196,7 +196,7 @@ class FiniteRun(UntimedRun):
     def take_back(self, mark: int) -> None:
         self.state = mark
 
-    def saved(self) -> tuple[int]:
+    def save(self) -> tuple[int]:
         return (self.state,)
 
     def restore(self, saved: tuple[int]) -> None:
@@ -288,7 +288,7 @@ class ClockedRun:
     def take_back(self, mark: tuple[int, int]) -> None:
         self.state, self.since = mark
 
-    def saved(self) -> tuple[int, int, int]:
+    def save(self) -> tuple[int, int, int]:
         return self.state, self.since, self.now
 
     def restore(self, saved: tuple[int, int, int]) -> None:

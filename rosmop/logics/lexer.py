@@ -148,7 +148,7 @@ class TokenReader:
                 number.offset, f"a number of more than {MAX_NUMBER_DIGITS} digits is not a duration"
             )
         unit = 10**9
-        if self.token.kind == "name" and (self.token.text in UNITS_NS or self._glued(number)):
+        if self.token.kind == "name" and (self.token.text in UNITS_NS or self._is_glued(number)):
             if self.token.text not in UNITS_NS:
                 raise self.source.error(
                     self.token.offset,
@@ -162,5 +162,5 @@ class TokenReader:
             raise self.source.error(number.offset, "a duration of more than 31 years; is the unit correct?")
         return int(nanoseconds)
 
-    def _glued(self, number: FormulaToken) -> bool:
+    def _is_glued(self, number: FormulaToken) -> bool:
         return self.token.offset == number.offset + len(number.text)

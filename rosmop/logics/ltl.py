@@ -253,7 +253,7 @@ class Automata:
             known = self._steps[state, letter] = frozenset(targets)
         return known
 
-    def _fulfilled(self, letter: int, target: Obligations, untils: Obligations) -> Obligations:
+    def _fulfil(self, letter: int, target: Obligations, untils: Obligations) -> Obligations:
         self._spend(1)
         found = untils & ~target
         for until in _members(untils & target):
@@ -295,7 +295,7 @@ class Automata:
                 for letter, target in edges[state]:
                     if target in inner:
                         cyclic = True
-                        missing &= ~self._fulfilled(letter, target, missing)
+                        missing &= ~self._fulfil(letter, target, missing)
                     elif self._live[target]:
                         alive = True
             verdict = alive or (cyclic and not missing)
@@ -417,7 +417,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
     named = event_names(formula)
     of_event, classes = letter_classes(source.events, named)
     past = _Past()
-    future = past.replaced(formula)
+    future = past.replace(formula)
     guesses = 1 << len(past.propositions)
     if len(classes) * guesses > MAX_LETTERS:
         raise source.error(0, f"{len(past.propositions)} different past operators; write a smaller formula")
@@ -431,9 +431,9 @@ def compile_ltl(source: Source) -> FiniteProperty:
     try:
         starts = [automata.live(automata.translate(side, atoms)) for side in sides]
         automaton = explore(
-            _settled(starts[0], starts[1]),
+            _settle(starts[0], starts[1]),
             len(classes),
-            lambda state, letter: _settled(*(automata.after(side, of_class[letter]) for side in state)),
+            lambda state, letter: _settle(*(automata.after(side, of_class[letter]) for side in state)),
             lambda state: ("violation",) if not state[0] else ("validation",) if not state[1] else (),
         )
     except TooManyStatesError as error:
@@ -445,7 +445,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
     return FiniteProperty(source, VERDICTS, spread(automaton, of_event))
 
 
-def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
+def _settle(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
     if not for_it:
         return frozenset(), _SOMETHING
     if not against_it:
@@ -461,9 +461,9 @@ class _Past:
         self.propositions: dict[Formula, str] = {}
         self.right: list[Formula] = []
 
-    def replaced(self, formula: Formula) -> Formula:
+    def replace(self, formula: Formula) -> Formula:
         operator = formula.operator
-        operands = tuple(self.replaced(operand) for operand in formula.operands)
+        operands = tuple(self.replace(operand) for operand in formula.operands)
         if operator == "once":
             return self._proposition("since", (Formula("true"), *operands))
         if operator == "historically":

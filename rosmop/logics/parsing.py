@@ -62,7 +62,7 @@ class EarleySet:
         self.conts = conts
         self.depth = depth
 
-    def saved(self) -> "tuple[Conts, int, EarleyShape]":
+    def save(self) -> "tuple[Conts, int, EarleyShape]":
         return self.conts, self.depth, self.shape
 
     def restore(self, saved: "tuple[Conts, int, EarleyShape]") -> None:

@@ -370,7 +370,7 @@ class SinceWindow:
         twin._intervals = self._intervals.copy()
         return twin
 
-    def saved(self) -> tuple[int, deque[tuple[int, int]], int]:
+    def save(self) -> tuple[int, deque[tuple[int, int]], int]:
         return self._high, self._intervals, self._low
 
     def restore(self, saved: tuple[int, deque[tuple[int, int]], int]) -> None:
@@ -407,7 +407,7 @@ class PastRun(UntimedRun):
     def take_back(self, mark: list[Any]) -> None:
         self.values = mark
 
-    def saved(self) -> tuple[int, list[Any]]:
+    def save(self) -> tuple[int, list[Any]]:
         return self.now, self.values
 
     def restore(self, saved: tuple[int, list[Any]]) -> None:

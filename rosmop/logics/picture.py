@@ -126,7 +126,7 @@ def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
             continue
         title = f"{compiled.logic}: {' '.join(compiled.formula.split())[:120]}"
         parts.append(f'<text class="title" x="{_MARGIN}" y="{top + 30}" {_TITLE}>{escape(title)}</text>')
-        states = _placed(diagram, top + _MARGIN)
+        states = _place(diagram, top + _MARGIN)
         first = states[diagram.initial]
         middle = first.y + _HEIGHT // 2
         parts.append(f'<path class="edge" d="M{first.x - 30} {middle}H{first.x}" {_LINE}/>')
@@ -158,7 +158,7 @@ def _document(parts: Sequence[str], width: int, height: int) -> str:
     )
 
 
-def _placed(diagram: Diagram, top: int) -> dict[int, _State]:
+def _place(diagram: Diagram, top: int) -> dict[int, _State]:
     distance = {diagram.initial: 0}
     waiting = deque([diagram.initial])
     while waiting:

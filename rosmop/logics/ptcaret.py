@@ -95,7 +95,7 @@ class CaretRun(UntimedRun):
                 values[place] = before
         return TOLD[holds]
 
-    def saved(self) -> tuple[Any, ...]:
+    def save(self) -> tuple[Any, ...]:
         return self._stack, self._values
 
     def restore(self, saved: tuple[Any, ...]) -> None:

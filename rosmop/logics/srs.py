@@ -64,16 +64,16 @@ class RewritingRun(UntimedRun, CostlyRun):
     def step(self, event: int, _time_ns: int) -> Categories:
         self.work = 0
         if not self.verdict:
-            self.string, self.verdict = self._rewritten([*self.string, event])
+            self.string, self.verdict = self._rewrite([*self.string, event])
         return self.verdict
 
-    def saved(self) -> tuple[list[int], Categories]:
+    def save(self) -> tuple[list[int], Categories]:
         return self.string, self.verdict
 
     def restore(self, saved: tuple[list[int], Categories]) -> None:
         self.string, self.verdict = saved
 
-    def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
+    def _rewrite(self, string: list[int]) -> tuple[list[int], Categories]:
         """Return the rewritten string and its verdict. Invariant: no rule matches before `place`."""
         longest = self._property.longest
         place = max(0, len(string) - longest)

@@ -17,8 +17,8 @@ from rosmop.fast.abi import ALTERED, BEYOND, MAX_KEPT, NOW, POSITION, SAID, UNDO
 from rosmop.fast.batch_codegen import WasmModule
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm import EXPORTED_FUNCTION, section, text, unsigned
-from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated
-from rosmop.fast.wasm_runner import cell_code, entered, left
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translate
+from rosmop.fast.wasm_runner import cell_code, put_value, take_value
 from rosmop.form.compiled import Compiled
 from rosmop.prove.decoding import EXPORTS, Reader, sections
 from rosmop.run.engine import MonitorSet
@@ -98,7 +98,7 @@ class ConcreteRuns:
     def __init__(self, compiled: Compiled, module: WasmModule) -> None:
         self._module, self._forms = module, compiled.functions
         numbers = sorted({number for feed in module.feeds.values() for number in feed.functions})
-        code = translated(_with_exports(module.code, numbers), module.memory)
+        code = translate(_with_exports(module.code, numbers), module.memory)
         self._instance = WasmInstance(code, module.memory)
         self._memory = self._instance.memory
         self._before = bytes(self._memory[: module.frames])
@@ -196,14 +196,14 @@ class ConcreteRuns:
         memory[: len(self._before)] = self._before
         for name, address, kind, buffer in self._cells:
             value = state.variables[name]
-            word = entered(memory, value, buffer, kind) if is_kept(kind) else value
+            word = put_value(memory, value, buffer, kind) if is_kept(kind) else value
             struct.pack_into("<" + cell_code(kind), memory, address, word)
         for key, address in module.throttles.items():
             _TIME.pack_into(memory, address, state.throttled.get(key, _NEVER))
         if context in module.senders:
             sender = module.senders[context]
             for place, raw in enumerate(state.names):
-                word = entered(memory, raw, sender + 16 + place * MAX_KEPT, value_types.STRING)
+                word = put_value(memory, raw, sender + 16 + place * MAX_KEPT, value_types.STRING)
                 _WORD.pack_into(memory, sender + 8 * place, word)
         _TIME.pack_into(memory, module.budgets[context], state.budget)
         _TIME.pack_into(memory, NOW, state.now)
@@ -227,7 +227,7 @@ class ConcreteRuns:
         """Return a string or an array, or None if it does not end within the memory."""
         count = word >> 32
         is_outside = (word & BEYOND) + count * kept_size(kind) > len(self._memory)
-        return None if count != BEYOND and is_outside else left(self._memory, word, before, kind)
+        return None if count != BEYOND and is_outside else take_value(self._memory, word, before, kind)
 
     def _output(self) -> list[LogLine] | None:
         memory, found = self._memory, []
@@ -247,7 +247,7 @@ def _with_exports(module: bytes, numbers: Iterable[int]) -> bytes:
     more = [text(f"event {number}") + EXPORTED_FUNCTION + unsigned(number) for number in numbers]
     parts = dict(sections(module))
     reader = Reader(parts[EXPORTS])
-    count = reader.unsigned() + len(more)
+    count = reader.read_unsigned() + len(more)
     parts[EXPORTS] = unsigned(count) + parts[EXPORTS][reader.at :] + b"".join(more)
     return module[:8] + b"".join(section(kind, content) for kind, content in parts.items())
 

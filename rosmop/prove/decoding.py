@@ -92,7 +92,7 @@ class Reader:
         self.at += 1
         return self._data[self.at - 1]
 
-    def unsigned(self) -> int:
+    def read_unsigned(self) -> int:
         value = shift = 0
         while True:
             byte = self.byte()
@@ -101,9 +101,9 @@ class Reader:
             if byte < 0x80:
                 return value
 
-    def signed(self) -> int:
+    def read_signed(self) -> int:
         begun = self.at
-        value = self.unsigned()
+        value = self.read_unsigned()
         bits = 7 * (self.at - begun)
         return value - (value >> bits - 1 << bits)
 
@@ -112,7 +112,7 @@ class Reader:
         return self._data[self.at - size : self.at]
 
     def types(self) -> tuple[str, ...]:
-        return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
+        return tuple(TYPES[self.byte()] for _ in range(self.read_unsigned()))
 
     def block(self) -> tuple[tuple[WasmInstruction, ...], int]:
         found: list[WasmInstruction] = []
@@ -126,21 +126,21 @@ class Reader:
         if code in PLAIN:
             return WasmInstruction(PLAIN[code])
         if code in MEMORY:
-            self.unsigned()  # the alignment, which is only a hint
-            return WasmInstruction(MEMORY[code], (self.unsigned(),))
+            self.read_unsigned()  # the alignment, which is only a hint
+            return WasmInstruction(MEMORY[code], (self.read_unsigned(),))
         if code in NUMBERED:
-            return WasmInstruction(NUMBERED[code], (self.unsigned(),))
+            return WasmInstruction(NUMBERED[code], (self.read_unsigned(),))
         if code in BLOCKS:
             kind = self.byte()
             body, end = self.block()
             otherwise = self.block()[0] if end == _ELSE else ()
             return WasmInstruction(BLOCKS[code], (kind,), body, otherwise)
         if code in (0x41, 0x42):
-            return WasmInstruction("i32.const" if code == 0x41 else "i64.const", (self.signed(),))
+            return WasmInstruction("i32.const" if code == 0x41 else "i64.const", (self.read_signed(),))
         if code in _FLOATS:
             name, layout = _FLOATS[code]
             return WasmInstruction(name, layout.unpack(self.take(layout.size)))
-        number = self.unsigned() if code == 0xFC else -1
+        number = self.read_unsigned() if code == 0xFC else -1
         if number in TRUNCATING:
             return WasmInstruction(TRUNCATING[number])
         if number == _COPY:
@@ -155,7 +155,7 @@ def sections(module: bytes) -> Iterator[tuple[int, bytes]]:
     reader = Reader(module)
     reader.take(8)
     while reader.at < len(module):
-        yield reader.byte(), reader.take(reader.unsigned())
+        yield reader.byte(), reader.take(reader.read_unsigned())
 
 
 def functions_of(module: bytes) -> list[Code]:
@@ -169,18 +169,18 @@ def functions_of(module: bytes) -> list[Code]:
     found: list[Code] = []
     for section, content in sections(module):
         reader = Reader(content)
-        for _ in range(reader.unsigned() if section in (_TYPES, _CHOSEN, CODES) else 0):
+        for _ in range(reader.read_unsigned() if section in (_TYPES, _CHOSEN, CODES) else 0):
             if section == _TYPES:
                 reader.byte()
                 types.append((reader.types(), reader.types()))
             elif section == _CHOSEN:
-                chosen.append(reader.unsigned())
+                chosen.append(reader.read_unsigned())
             else:
-                reader.unsigned()
+                reader.read_unsigned()
                 parameters, results = types[chosen[len(found)]]
                 made: list[str] = []
-                for _ in range(reader.unsigned()):
-                    count = reader.unsigned()
+                for _ in range(reader.read_unsigned()):
+                    count = reader.read_unsigned()
                     made += [TYPES[reader.byte()]] * count
                 found.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
     return found

@@ -25,7 +25,7 @@ from itertools import islice
 import z3
 
 from rosmop.fast.abi import AREA, SENDER, is_kept, is_texts, kept_size, most_kept, room_of
-from rosmop.fast.batch_codegen import WasmModule, written
+from rosmop.fast.batch_codegen import WasmModule, write
 from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.specification_groups import groups
 from rosmop.prove.concrete_runs import (
@@ -43,9 +43,9 @@ from rosmop.prove.concrete_runs import (
 from rosmop.prove.decoding import functions_of
 from rosmop.prove.event_terms import FormResult
 from rosmop.prove.form_terms import FormTerms
-from rosmop.prove.loops import BUDGET_SLOT, assumed, loop_conditions
+from rosmop.prove.loops import BUDGET_SLOT, assumption, loop_conditions
 from rosmop.prove.module_terms import LoopGuess, ModuleExecution, ModuleResult, Pointer, ReadableBytes
-from rosmop.prove.number_terms import wrapped
+from rosmop.prove.number_terms import wrap
 from rosmop.prove.questions import Effort, MayDifferError, Questions, first_difference
 from rosmop.prove.random_states import STATES, RandomStates
 from rosmop.prove.terms import (
@@ -198,7 +198,7 @@ class ProofFinding:
 
 def findings_of(compiled: Compiled, patience: float = PATIENCE) -> Iterator[ProofFinding]:
     found = list(groups(compiled.specifications))
-    module = written(compiled.functions, [group.component for group in found], ValueCodec(compiled.messages))
+    module = write(compiled.functions, [group.component for group in found], ValueCodec(compiled.messages))
     validation = Validation(compiled, module, patience)
     for group in found:
         for (topic, _), numbers in zip(group.component.topics, group.events, strict=True):
@@ -316,13 +316,13 @@ class Validation:
             self._spans(begin), guess,
         )  # fmt: skip
         try:
-            done = execution.done()
+            done = execution.run()
         except DiffersError:
             if meant.unknown and any(map(is_texts, self._kinds.values())):  # `cells` lacks these
                 raise NotProvedError(f"uses {next(iter(meant.unknown))}") from None
             raise
         self._check_undone(done, event.topic)
-        known += assumed(form_cuts)
+        known += assumption(form_cuts)
         going_on = either(meant.loops.again, done.loops.again)
         left = either(done.trapped, both(_bit(done.bits, ELSEWHERE), opposite(done.loops.again)))
         unknown = either(*meant.unknown.values())
@@ -470,5 +470,5 @@ def _variable(name: str, kind: Type) -> Term:
     if isinstance(kind, value_types.FloatingType):
         return z3.FP(name, DOUBLE if kind.bits == 64 else SINGLE)
     if isinstance(kind, value_types.IntegerType) and kind.bits <= 32:
-        return wrapped(z3.BitVec(name, 32), kind)
+        return wrap(z3.BitVec(name, 32), kind)
     return z3.BitVec(name, 64)

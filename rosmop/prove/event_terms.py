@@ -24,7 +24,7 @@ from rosmop.prove.terms import (
     choice,
     either,
     integer,
-    merged,
+    merge,
     opposite,
 )
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
@@ -133,7 +133,7 @@ class EventTerms:
         end = State(no, slots)
         for left, value in self.event_ends.exits:
             happened = choice(left.alive, value, happened)
-            end = State(no, merged(left.alive, left, State(opposite(left.alive), end.slots)))
+            end = State(no, merge(left.alive, left, State(opposite(left.alive), end.slots)))
         unknown: dict[str, Term] = {}
         for what, condition in self.event_ends.unknown:
             unknown[what] = either(unknown.get(what, no), condition)
@@ -175,7 +175,7 @@ class EventTerms:
         return row(self, node, state)
 
     def term(self, node: nodes.Expression, state: State) -> Term:
-        return known(self.value(node, state), node.type)
+        return require_term(self.value(node, state), node.type)
 
     def spend(self, instructions: Term, state: State) -> None:
         rest = state.term(BUDGET_SLOT) - instructions
@@ -187,7 +187,7 @@ class EventTerms:
         self.spend(z3.UDiv(size, integer(BYTES_PER_INSTRUCTION, 64)), state)
 
 
-def known(value: Value, kind: Type) -> Term:
+def require_term(value: Value, kind: Type) -> Term:
     if not isinstance(value, Term):
         raise UnknownError(f"a value of type {kind}")
     return value

@@ -8,7 +8,7 @@ import z3
 
 from rosmop.fast.abi import kept_size, most_kept
 from rosmop.form import nodes
-from rosmop.prove.event_terms import ActiveCall, EventTerms, Value, View, known
+from rosmop.prove.event_terms import ActiveCall, EventTerms, Value, View, require_term
 from rosmop.prove.message_terms import number, size_of
 from rosmop.prove.number_terms import (
     LONG,
@@ -17,15 +17,15 @@ from rosmop.prove.number_terms import (
     QUESTIONS,
     ROUNDED,
     UnknownError,
-    chosen,
-    compared,
-    converted,
+    choose,
+    compare_terms,
+    convert_term,
     is_signed,
     parts,
-    truncated,
+    truncate,
     whole_number,
     width,
-    wrapped,
+    wrap,
 )
 from rosmop.prove.terms import (
     AT,
@@ -44,7 +44,7 @@ from rosmop.prove.terms import (
     either,
     floating,
     integer,
-    merged,
+    merge,
     number_at,
     opposite,
     with_sign,
@@ -116,7 +116,7 @@ def assign(event: EventTerms, node: nodes.Assign, state: State) -> Value:
 
 
 def convert(event: EventTerms, node: nodes.Convert, state: State) -> Value:
-    return converted(event.term(node.value, state), node.value.type, node.type)
+    return convert_term(event.term(node.value, state), node.value.type, node.type)
 
 
 def arithmetic(event: EventTerms, node: nodes.Arithmetic, state: State) -> Value:
@@ -140,7 +140,7 @@ def arithmetic(event: EventTerms, node: nodes.Arithmetic, state: State) -> Value
         )
     else:
         result = OF_INTEGERS[operator](left, right)
-    return wrapped(result, kind)
+    return wrap(result, kind)
 
 
 def unary(event: EventTerms, node: nodes.Unary, state: State) -> Value:
@@ -153,7 +153,7 @@ def unary(event: EventTerms, node: nodes.Unary, state: State) -> Value:
         result = -value
     else:
         result = z3.If(value < 0, -value, value) if is_signed(node.type) else value
-    return wrapped(result, node.type) if isinstance(node.type, value_types.IntegerType) else result
+    return wrap(result, node.type) if isinstance(node.type, value_types.IntegerType) else result
 
 
 def moment(event: EventTerms, node: nodes.Moment, state: State) -> Value:
@@ -193,7 +193,7 @@ def compare(event: EventTerms, node: nodes.Compare, state: State) -> Value:
     if isinstance(kind, value_types.VectorType | value_types.RecordType):
         raise UnknownError(f"a comparison of values of type {kind}")
     left, right = event.term(node.left, state), event.term(node.right, state)
-    return compared(node.operator, left, right, kind)
+    return compare_terms(node.operator, left, right, kind)
 
 
 def compare_texts(event: EventTerms, node: nodes.CompareTexts, state: State) -> Value:
@@ -277,12 +277,12 @@ def throttle(event: EventTerms, node: nodes.Throttle, state: State) -> Value:
     last = event.beginning.throttles.get((event.function.context, node.site))
     if last is None:
         raise UnknownError("output with a rate limit")
-    seconds = converted(event.term(node.seconds, state), node.seconds.type, value_types.FloatingType(64))
+    seconds = convert_term(event.term(node.seconds, state), node.seconds.type, value_types.FloatingType(64))
     more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
     until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
     # A whole number is below `until` if it is below the next whole number. A time is from 0 to below 2**62, so the
     # limits of the type do not matter, and nothing is below NaN.
-    first = truncated(z3.fpRoundToIntegral(z3.RTP(), until), LONG)
+    first = truncate(z3.fpRoundToIntegral(z3.RTP(), until), LONG)
     now = event.beginning.now
     event.leave_to_python(state, opposite(both(last <= now, now < first)))
     return z3.BoolVal(False)
@@ -329,7 +329,7 @@ def call(event: EventTerms, node: nodes.Call, state: State) -> Value:
     if name in _OF_VIEWS and isinstance(values[0], View | TextTerm):
         return _OF_VIEWS[name](values[0].count)
     if name == "l_element" and isinstance(values[0], View | TextTerm):
-        return element(event, values[0], kind, known(values[1], arguments[1].type), state)
+        return element(event, values[0], kind, require_term(values[1], arguments[1].type), state)
     terms = terms_of(values, name)
     rounded = name.removesuffix("f") if kind == value_types.FloatingType(32) else name
     if (
@@ -346,10 +346,10 @@ def call(event: EventTerms, node: nodes.Call, state: State) -> Value:
         state.require(opposite(none))
         return with_sign(*terms)
     if name in ("h_min", "h_max"):
-        return chosen(compared("<" if name == "h_min" else ">", terms[1], terms[0], kind), terms)
+        return choose(compare_terms("<" if name == "h_min" else ">", terms[1], terms[0], kind), terms)
     if name in ("h_fmin", "h_fmax") and kind == value_types.FloatingType(64):
         less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(terms[1], terms[0])
-        return chosen(either(z3.fpIsNaN(terms[0]), less), terms)
+        return choose(either(z3.fpIsNaN(terms[0]), less), terms)
     if name in _OF_MOMENTS:
         value = _OF_MOMENTS[name](terms[0])
         if isinstance(node.type, value_types.IntegerType) and width(node.type) == 32:
@@ -374,7 +374,7 @@ def with_part(event: EventTerms, node: nodes.Call, state: State) -> Term:
     moment, part, new = node.arguments
     assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
     old = event.term(moment, state)
-    value = converted(event.term(new, state), new.type, LONG)
+    value = convert_term(event.term(new, state), new.type, LONG)
     seconds, rest = parts(old)
     one, other = (value, rest) if part.value == b"sec" else (seconds, value)
     return of_parts(event, node.type, one, other, state)
@@ -404,7 +404,7 @@ def invoke(event: EventTerms, node: nodes.Invoke, state: State) -> Value:
     end, result = ends[-1]
     for before, value in ends[-2::-1]:
         result = choice(before.alive, value, result)
-        end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+        end = State(either(before.alive, end.alive), merge(before.alive, before, end))
     state.alive, state.slots = end.alive, end.slots
     return result
 

@@ -20,7 +20,7 @@ from rosmop.prove.event_terms import (
     ExpressionRow,
     StatementRow,
     View,
-    known,
+    require_term,
 )
 from rosmop.prove.loops import GrowingList, constant_for
 from rosmop.prove.number_terms import UnknownError, word
@@ -165,7 +165,7 @@ def log(event: EventTerms, node: nodes.Log, state: State) -> None:
             cost = cost + z3.UDiv(value.count, integer(BYTES, 64))
             words.append(text_word(value))
         else:
-            words.append(word(known(value, expression.type), expression.type))
+            words.append(word(require_term(value, expression.type), expression.type))
     put_out(event, node, words, cost, state)
 
 

@@ -30,7 +30,7 @@ from rosmop.prove.terms import (
     as_term,
     both,
     either,
-    merged,
+    merge,
     opposite,
 )
 from rosmop.runtime.action_context import BUDGET
@@ -178,7 +178,7 @@ def loop_conditions(
             )
 
 
-def assumed(form: Sequence[Cut]) -> Sequence[Term]:
+def assumption(form: Sequence[Cut]) -> Sequence[Term]:
     """Return the assumption that the budget at the head of each loop is at most the budget before the loop."""
     bounds = []
     for cut in form:
@@ -225,7 +225,7 @@ def _join(states: Sequence[State]) -> State:
         return State(z3.BoolVal(False), {})
     end = alive[-1]
     for before in alive[-2::-1]:
-        end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+        end = State(either(before.alive, end.alive), merge(before.alive, before, end))
     return end
 
 

@@ -10,7 +10,7 @@ import z3
 
 from rosmop.form import nodes
 from rosmop.prove.event_terms import CHANGED, DROPPED, MESSAGE, REPLACED, EventTerms, View
-from rosmop.prove.number_terms import UnknownError, decoded, parts
+from rosmop.prove.number_terms import UnknownError, decode, parts
 from rosmop.prove.terms import (
     State,
     Term,
@@ -58,10 +58,10 @@ def after_text(event: EventTerms, node: nodes.AfterText, state: State) -> None:
 
 
 def count_elements(event: EventTerms, node: nodes.Count, state: State) -> None:
-    state.slots[event.active.frame, node.name] = counted(event, node.at, node.least, state)
+    state.slots[event.active.frame, node.name] = element_count(event, node.at, node.least, state)
 
 
-def counted(event: EventTerms, at: nodes.Spot, least: int, state: State) -> Term:
+def element_count(event: EventTerms, at: nodes.Spot, least: int, state: State) -> Term:
     count = text_length(event, at, state)
     room = z3.ZeroExt(32, event.beginning.size) - position(event, at.plus(4), state)
     many = z3.UGT(count * least, room) if least else z3.UGT(count, MAX_EMPTY)
@@ -91,7 +91,7 @@ def read_numbers(event: EventTerms, node: nodes.ReadNumbers, state: State) -> No
 
 
 def number(event: EventTerms, message: Term, place: Term, kind: Type) -> Term:
-    return decoded(number_at(message, place, size_of(event, kind)), kind)
+    return decode(number_at(message, place, size_of(event, kind)), kind)
 
 
 def size_of(event: EventTerms, kind: Type) -> int:
@@ -114,7 +114,7 @@ def read_value(event: EventTerms, node: nodes.ReadValue, state: State) -> None:
         event.leave_to_python(state, z3.UGT(start + count, z3.ZeroExt(32, event.beginning.size)))
     elif isinstance(kind, value_types.VectorType) and kind.length is None:
         size = size_of(event, kind.element)
-        count = counted(event, node.at, size, state)
+        count = element_count(event, node.at, size, state)
         start = position(event, node.at.plus(4), state)
     else:
         size = size_of(event, kind)
@@ -143,7 +143,7 @@ def write_back(event: EventTerms, node: nodes.WriteBack, state: State) -> None:
             state.require(opposite(flag))
             continue
         wanted = state.where(flag)
-        bits = packed(event, event.term(write.value, wanted), write.value.type, wanted)
+        bits = bits_of(event, event.term(write.value, wanted), write.value.type, wanted)
         state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
         puts.append((flag, bits, place_of(event, write.at, state)))
     for flag, bits, place in puts:
@@ -166,7 +166,7 @@ def put_safe(safe: nodes.SafeMessage, state: State) -> None:
     state.slots |= {MESSAGE: message, CHANGED: changed}
 
 
-def packed(event: EventTerms, value: Term, kind: Type, state: State) -> Term:
+def bits_of(event: EventTerms, value: Term, kind: Type, state: State) -> Term:
     if isinstance(kind, value_types.FloatingType):
         event.leave_to_python(state, z3.fpIsNaN(value))
         return z3.fpToIEEEBV(value)

@@ -43,7 +43,7 @@ from rosmop.prove.terms import (
     either,
     floating,
     integer,
-    merged,
+    merge,
     number_at,
     opposite,
     with_number,
@@ -172,7 +172,7 @@ class ModuleExecution:
         self._state = State(z3.BoolVal(True), slots)
         self._number = number
 
-    def done(self) -> ModuleResult:
+    def run(self) -> ModuleResult:
         state = self._state
         bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
         cells = {
@@ -204,7 +204,7 @@ class ModuleExecution:
         end, result = ends[-1]
         for before, value in ends[-2::-1]:
             result = choice(before.alive, value, result)
-            end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+            end = State(either(before.alive, end.alive), merge(before.alive, before, end))
         state.alive, state.slots = end.alive, end.slots
         return result
 
@@ -338,11 +338,11 @@ class ModuleExecution:
                 raise DiffersError("it reads its own log")
             size = int(how.partition("_")[0] or bits) // 8
             number = number_at(state.term(_MESSAGE), self._within(address, int(offset), size, state), size)
-            return _loaded(number, family, how)
+            return _load(number, family, how)
         span = self._span(address)
         if span is not None:
             size = int(how.partition("_")[0] or bits) // 8
-            return _loaded(
+            return _load(
                 number_at(MEMORY, self._in_span(as_term(address), int(offset), size, span, state), size),
                 family,
                 how,
@@ -364,7 +364,7 @@ class ModuleExecution:
         size = int(how or family[1:]) // 8
         if isinstance(address, Pointer) and address.place == "lines":
             begin = address.offset + integer(int(offset), 32)
-            state.slots[_LINES] = with_number(state.term(_LINES), begin, _stored(value, size))
+            state.slots[_LINES] = with_number(state.term(_LINES), begin, _store(value, size))
             return
         if isinstance(address, Pointer):
             (self._write if address.place == "message" else self._note)(
@@ -479,14 +479,14 @@ def _same_sort(one: Term, other: Term) -> bool:
     return bool(sorts[0] == sorts[1])
 
 
-def _loaded(value: Term, family: str, how: str) -> Term:
+def _load(value: Term, family: str, how: str) -> Term:
     if family in ("f32", "f64"):
         return z3.fpBVToFP(value, _SORTS[family])
     missing = int(family[1:]) - value.size()
     return value if not missing else (z3.SignExt if how.endswith("_s") else z3.ZeroExt)(missing, value)
 
 
-def _stored(value: Value, size: int) -> Term:
+def _store(value: Value, size: int) -> Term:
     if isinstance(value, Pointer):
         if value.place != "message":
             raise DiffersError("it logs an address outside the message")

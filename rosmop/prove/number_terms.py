@@ -39,7 +39,7 @@ def width(kind: Type) -> int:
     return 32 if isinstance(kind, value_types.IntegerType) and kind.bits <= 32 else 64
 
 
-def wrapped(value: Term, kind: value_types.IntegerType) -> Term:
+def wrap(value: Term, kind: value_types.IntegerType) -> Term:
     if kind.bits >= 32:
         return value
     return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
@@ -52,7 +52,7 @@ def word(value: Term, kind: Type) -> Term:
     return bits if bits.size() == 64 else (z3.SignExt if is_signed(kind) else z3.ZeroExt)(32, bits)
 
 
-def converted(value: Term, source: Type, target: Type) -> Term:
+def convert_term(value: Term, source: Type, target: Type) -> Term:
     if isinstance(target, value_types.BoolType):
         if isinstance(source, value_types.FloatingType):
             return opposite(z3.fpIsZero(value))
@@ -67,13 +67,13 @@ def converted(value: Term, source: Type, target: Type) -> Term:
     if not isinstance(target, value_types.IntegerType):
         raise UnknownError(f"a conversion to {target}")
     if isinstance(source, value_types.FloatingType):
-        return truncated(converted(value, source, value_types.FloatingType(64)), target)
+        return truncate(convert_term(value, source, value_types.FloatingType(64)), target)
     if width(target) > value.size():
         value = (z3.SignExt if is_signed(source) else z3.ZeroExt)(32, value)
-    return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
+    return wrap(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
 
-def truncated(value: Term, target: value_types.IntegerType) -> Term:
+def truncate(value: Term, target: value_types.IntegerType) -> Term:
     whole = target if target.bits >= 32 else value_types.INT
     bits = whole.bits
     least, most = floating(whole.least, 64), floating(whole.most, 64)
@@ -87,7 +87,7 @@ def truncated(value: Term, target: value_types.IntegerType) -> Term:
     return result
 
 
-def decoded(bits: Term, kind: Type) -> Term:
+def decode(bits: Term, kind: Type) -> Term:
     if isinstance(kind, value_types.TimeType | value_types.DurationType):
         extend = z3.ZeroExt if kind == value_types.TIME else z3.SignExt
         seconds, rest = (extend(32, z3.Extract(more + 31, more, bits)) for more in (0, 32))
@@ -113,7 +113,7 @@ def whole_number(value: int, kind: Type) -> Term:
     return z3.BoolVal(bool(value)) if isinstance(kind, value_types.BoolType) else integer(value, width(kind))
 
 
-def chosen(second: Term, values: Sequence[Term]) -> Term:
+def choose(second: Term, values: Sequence[Term]) -> Term:
     return z3.If(second, values[1], values[0])
 
 
@@ -121,7 +121,7 @@ def _bits(value: Term) -> int:
     return 64 if value.sort() == DOUBLE else 32
 
 
-def compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
+def compare_terms(operator: str, left: Term, right: Term, kind: Type) -> Term:
     if isinstance(kind, value_types.BoolType) and operator not in ("==", "!="):
         left, right = map(as_bits, (left, right))
     if isinstance(kind, value_types.FloatingType):

@@ -123,7 +123,7 @@ class RandomStates:
             message = self._message()
         else:  # the same message again, or with a few other numbers
             for _ in range(random.choice((0, 1, 1, 2))):
-                self._fields = self._changed(self._fields, self._kind)
+                self._fields = self._change(self._fields, self._kind)
             message = self._encode()
         self._now = state.now + random.choice((0, 10**6, 10**8))
         variables = {name: after[name] for name in self._kinds}
@@ -153,7 +153,7 @@ class RandomStates:
         self._values.encoder(self._kind)(self._fields, raw)
         return bytes(raw)
 
-    def _changed(self, value: Value, kind: Type) -> Value:
+    def _change(self, value: Value, kind: Type) -> Value:
         """Return a copy of a value in which one number or string is drawn again."""
         random = self._random
         if isinstance(kind, value_types.FloatingType) and random.random() < 0.3:
@@ -167,7 +167,7 @@ class RandomStates:
         else:
             assert isinstance(kind, value_types.VectorType)  # noqa: S101  only these two have lists as values
             inner = kind.element
-        return [*value[:place], self._changed(value[place], inner), *value[place + 1 :]]
+        return [*value[:place], self._change(value[place], inner), *value[place + 1 :]]
 
     def _value(self, kind: Type) -> Value:
         random = self._random

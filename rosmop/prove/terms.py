@@ -159,10 +159,10 @@ class State:
     def join(self, test: Term, yes: "State", no: "State") -> None:
         whole = yes.alive.eq(both(self.alive, test)) and no.alive.eq(both(self.alive, opposite(test)))
         self.alive = self.alive if whole else either(yes.alive, no.alive)
-        self.slots = merged(test, yes, no)
+        self.slots = merge(test, yes, no)
 
 
-def merged(test: Term, yes: State, no: State) -> dict[object, object]:
+def merge(test: Term, yes: State, no: State) -> dict[object, object]:
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):

@@ -115,7 +115,7 @@ def sender_of(connection: Connection) -> ConnectionExtRosbag1:
     return connection.ext
 
 
-def received(reader: Reader, patterns: Sequence[str], own: str = OWN) -> list[Connection]:
+def inputs(reader: Reader, patterns: Sequence[str], own: str = OWN) -> list[Connection]:
     """Return the connections on topics that match a pattern whose messages monitors got. Monitors publish as `own`."""
     return [
         row
@@ -152,8 +152,8 @@ class RecordedFile:
             self.message_count = reader.message_count
             if not self.message_count:
                 raise RecordingError(f"the bag {path} has no messages")
-            rows = received(reader, patterns)
-            self.definitions = known or standard_definitions().extended(_definitions_of(rows))
+            rows = inputs(reader, patterns)
+            self.definitions = known or standard_definitions().merge(_definitions_of(rows))
             wanted = dict(kinds or {})
             self._connections: set[int] = set()
             self.notes: list[str] = []

@@ -18,13 +18,13 @@ from rosmop.recordings.recording import (
     OWN,
     Reader,
     RecordingError,
+    inputs,
     messages_of,
-    received,
     ros_type,
     sender_of,
 )
 from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import DROPPED, MessageSender, Outcome, Verdict, bound
+from rosmop.run.outcomes import DROPPED, MessageSender, Outcome, Verdict, binding
 from roswire.definitions import Definitions
 
 EVER = (0, 1 << 63)
@@ -78,7 +78,7 @@ class OutputBag:
         self._write((*sent, *sender_of(connection)), time_ns, data, published=False)
 
     def publish(self, outcome: Outcome) -> None:
-        for message in (one for one in outcome.sent() if not one.is_call):
+        for message in (one for one in outcome.sent_messages() if not one.is_call):
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
             header = (message.topic, f"{package}/msg/{kind}", text, digest, OWN, None)
@@ -120,7 +120,7 @@ def replay(
     under which monitors published.
     """
     started: Outcome | None = None
-    refusals = {connection.id: _refusal(monitors, connection) for connection in received(reader, topics, own)}
+    refusals = {connection.id: _refusal(monitors, connection) for connection in inputs(reader, topics, own)}
     expected = frozenset(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
     )
@@ -185,7 +185,7 @@ class _ExplainOnce:
         if self._second != self.now // 10**9:
             self._second = self.now // 10**9
             self._explained.clear()
-        key = verdict.monitor, verdict.property, verdict.category, bound(verdict)
+        key = verdict.monitor, verdict.property, verdict.category, binding(verdict)
         is_new = key not in self._explained
         self._explained.add(key)
         return is_new
@@ -242,9 +242,7 @@ def refusals(
 
     With `strict`, the recording's name, raise `RecordingError` if none of a topic's connections is.
     """
-    rows = [
-        (connection.topic, _refusal(monitors, connection)) for connection in received(reader, topics, own)
-    ]
+    rows = [(connection.topic, _refusal(monitors, connection)) for connection in inputs(reader, topics, own)]
     judged = {topic for topic, text in rows if text is None}
     for topic, text in sorted(rows, key=lambda row: row[1] or ""):
         if strict is not None and topic not in judged:

@@ -31,9 +31,9 @@ from rosmop.run.slice_quota import HolderOf, no_holder
 from rosmop.run.slices import LIMIT
 from rosmop.run.state import (
     GroupSnapshot,
-    encoded,
+    encode,
+    encode_refusal,
     kept_monitor,
-    refused,
     restore,
     shape,
     states_of,
@@ -132,11 +132,11 @@ class KeptGroup:
     def base(self) -> bytes:
         group = self._group
         try:
-            data = encoded([
+            data = encode([
                 kept_monitor(monitor, self._variables, self._types[monitor.name]) for monitor in group.monitors
             ])  # fmt: skip
         except StateTooLargeError as error:
-            data = refused(str(error))
+            data = encode_refusal(str(error))
         group.changed = False
         if group.home is not None:
             group.home.left = False
@@ -149,7 +149,7 @@ class KeptGroup:
         return {
             place * BUCKETS + number: data
             for place, parts in enumerate(self._slices)
-            for number, data in parts.changed().items()
+            for number, data in parts.changed_parts().items()
         }
 
 
@@ -354,7 +354,7 @@ class MonitorSet:
         steps = self.steps.get(topic, ())
         return next((step.event.type for step in steps if shadowed or not isinstance(step, Tap)), None)
 
-    def stamped(self, topic: str) -> bool:
+    def is_stamped(self, topic: str) -> bool:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
@@ -384,12 +384,12 @@ class MonitorSet:
     def name_senders(self, names: Callable[[int], tuple[str, str]]) -> None:
         """Set how the host and the caller id of a source are found; source 0 has neither."""
 
-        def encoded(source: int) -> tuple[bytes, bytes]:
+        def encode(source: int) -> tuple[bytes, bytes]:
             host, caller = names(source) if source else ("", "")
             return host.encode(), caller.encode()
 
         for part in (self, *self.shadows):
-            part.interpreter.turn.names = encoded
+            part.interpreter.turn.names = encode
 
     def explain_when(self, asked: Asked, shadowed: Asked) -> None:
         """Explain a verdict only if `asked` (in shadow mode: `shadowed`) is true for the message's source."""
@@ -580,7 +580,7 @@ class MonitorSet:
     def safe_message(self, name: str, topic: str, time_ns: int) -> bytes | None:
         """Return the safe message of a specification for a topic, as it is sent at a time; None if it has none."""
         sender = self.monitor(name).safes.get(topic)
-        return None if sender is None else safe_messages.sent(sender.safe, time_ns)
+        return None if sender is None else safe_messages.to_bytes(sender.safe, time_ns)
 
     def only_stops(self, event: str) -> bool:
         """Whether the event, named `specification.event`, changes messages only to the safe message."""
@@ -638,7 +638,7 @@ class MonitorSet:
         }
         departed = {monitor.name for monitor in before.monitors if before.has_departed(monitor)}
         self._beginnings |= before._beginnings
-        others = _redefined(before.definitions, self.definitions)
+        others = _redefined_types(before.definitions, self.definitions)
         shadowed = [shadow._follow(known, others, time_ns) for shadow in self.shadows]
         for monitor in self.shadowed:
             monitor.resume()
@@ -748,7 +748,7 @@ class MonitorSet:
                 present = part.interpreter.variables
                 for given in monitor.code.givens:
                     value = wanted.get(given.name, given.default)
-                    value = given.held(value if given.holds(value) else given.default)
+                    value = given.to_type(value if given.holds(value) else given.default)
                     if present[given.code] != value:
                         monitor.move_to_python()
                         monitor.touch()
@@ -1012,7 +1012,7 @@ def _groups(compiled: Compiled, monitors: Sequence[MonitorInstance]) -> Iterator
         yield group
 
 
-def _redefined(before: Definitions, after: Definitions) -> frozenset[str]:
+def _redefined_types(before: Definitions, after: Definitions) -> frozenset[str]:
     if before is after:
         return frozenset()
     both = set(before.message_types) & set(after.message_types)

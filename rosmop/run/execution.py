@@ -181,7 +181,7 @@ class MonitorExecution:
         self._sender, turn = sender, self._turn
         turn.now, turn.source = outcome.time, sender.source
         acting = [step.monitor for step in steps if step.first]
-        admitted = self._admitted(acting, lane.topic)
+        admitted = self._admit(acting, lane.topic)
         if admitted is None:
             return False
         judging, heard = admitted
@@ -214,7 +214,7 @@ class MonitorExecution:
             tap.function(WireMessage(outcome.buffer, outcome.time, lane.topic))
         return True
 
-    def _admitted(
+    def _admit(
         self, monitors: Sequence[MonitorInstance], channel: str
     ) -> tuple[list[MonitorInstance], list[tuple[MonitorInstance, Origin]]] | None:
         """Return the monitors that judge a message, and those that awaited it; None if one drops it unjudged."""
@@ -299,7 +299,7 @@ class MonitorExecution:
         safe = sender.safe
         outcome = Outcome(time=time_ns)
         outcome.timer, outcome.repeated = f"{monitor.name}.safe", sender.due is not None
-        data = safe_messages.sent(safe, time_ns)
+        data = safe_messages.to_bytes(safe, time_ns)
         outcome.published = [Published(monitor.name, safe.topic, safe.type, data, safe.site)]
         outcome.sites = self._interpreter.sites
         sender.due = time_ns + safe.period_ns
@@ -443,7 +443,7 @@ class MonitorExecution:
         """Whether subscribers got a message, as monitors left it, that the awaited event accepts."""
         remedy = running.remedy
         assert remedy is not None  # noqa: S101  the caller checks this
-        for sent in outcome.sent():
+        for sent in outcome.sent_messages():
             if sent.is_call or sent.topic != remedy.event.topic:
                 continue
             message = WireMessage(sent.data, outcome.time, sent.topic)
@@ -605,7 +605,7 @@ class MonitorExecution:
         if 0 < reached < len(found) and trail and trail[-1] is self._bound:
             trail[-1] = self._bound._replace(everywhere=False)
         outcome.events, outcome.verdicts, outcome.faults = events, tuple(verdicts), tuple(faults)
-        if text := slices.forgotten(outcome.time):
+        if text := slices.report_forgotten(outcome.time):
             self.warn(monitor, text)
         if refused is not None and (message is None or not message.dropped):
             self._refuse_slice(step, refused, why, message, outcome)

@@ -122,7 +122,7 @@ class FastLane(Protocol):
     def writers(self, who: int) -> tuple[str, ...]:
         """Return `Outcome.changed_by` for a set of events: bit N is event N."""
 
-    def happened(self) -> Sequence[int]:
+    def take_events(self) -> Sequence[int]:
         """Return the events since the last call."""
 
     def ready(self) -> bool:
@@ -182,7 +182,7 @@ class FastLane(Protocol):
         """Return None for a message left to the engine. Verdicts are not explained, and changes have no positions.
 
         The conditions are those of `process_batch`. Use separate options for this method, and do not call
-        `happened`.
+        `take_events`.
         """
 
     exhausted: bool

@@ -391,7 +391,7 @@ class _Maker:
                 message.stop(own[message.channel], site)
                 return
             for safe in node.safes:
-                context.publish(safe.topic, safe.type, safe_messages.sent(safe, turn.now), site)
+                context.publish(safe.topic, safe.type, safe_messages.to_bytes(safe, turn.now), site)
 
         return run
 
@@ -409,7 +409,7 @@ class _Maker:
         is_call = bool(node.service)
 
         def run(v: Variables) -> None:
-            context.publish(topic, kind, _encoded(encode, value(v), site), site, is_call=is_call)
+            context.publish(topic, kind, _encode(encode, value(v), site), site, is_call=is_call)
 
         return run
 
@@ -469,12 +469,12 @@ class _Maker:
             return partial(wire.texts_end, number=len(skipper.body))
         body, end = self.block(skipper.body), self._position(skipper.end)
 
-        def skipped(buffer: wire.Buffer, start: int) -> int:
+        def skip(buffer: wire.Buffer, start: int) -> int:
             inner: Variables = {"b": buffer, "p": start}
             body(inner)
             return int(end(inner))
 
-        return skipped
+        return skip
 
     def _not_past(self, node: nodes.NotPast) -> _Run:
         name, index, site = node.count, node.index, node.site
@@ -561,7 +561,7 @@ class _Maker:
             for flag, value, encode, at, end in writes:
                 by = v[flag]
                 if by:
-                    out = _encoded(encode, value(v), marks[by.bit_length() - 1])
+                    out = _encode(encode, value(v), marks[by.bit_length() - 1])
                     if end is None:
                         patched.append((at(v), out, by))
                     else:
@@ -671,7 +671,7 @@ class _Maker:
         left, right, measure = self.value(node.left), self.value(node.right), self._values.measure(kind)
         context, site, same = self._context, node.site, self._values.same(kind)
         equal = node.operator == "=="
-        return lambda v: same(vectors.weighed(context, left(v), measure, site), right(v)) is equal
+        return lambda v: same(vectors.charge(context, left(v), measure, site), right(v)) is equal
 
     def _compare_texts(self, node: nodes.CompareTexts) -> _Value:
         compare, context, site = _CALCULATED[node.operator], self._context, node.site
@@ -683,7 +683,7 @@ class _Maker:
             few = known and len(right(v)) <= nodes.SHORT
             first = left(v)
             if not few:
-                strings.charged(context, first, site)
+                strings.charge(context, first, site)
             return bool(compare(first, right(v)))
 
         return compared
@@ -804,13 +804,11 @@ class _Maker:
         template, size, context, site = node.template, node.size, self._context, node.site
         arguments = [self.value(argument) for argument in node.arguments]
 
-        def formatted(v: Variables) -> bytes:
+        def format_row(v: Variables) -> bytes:
             row = tuple([argument(v) for argument in arguments])
-            return (
-                template % row if size is None else formatting.formatted(context, template, row, size, site)
-            )
+            return template % row if size is None else formatting.render(context, template, row, size, site)
 
-        return formatted
+        return format_row
 
     def _join(self, node: nodes.Join) -> _Value:
         pieces, context, site = [self.value(piece) for piece in node.pieces], self._context, node.site
@@ -846,7 +844,7 @@ class _Maker:
         return whole
 
 
-def _encoded(encode: Callable[[Any, bytearray], None], value: Any, site: int) -> bytes:
+def _encode(encode: Callable[[Any, bytearray], None], value: Any, site: int) -> bytes:
     out = bytearray()
     try:
         encode(value, out)
@@ -899,7 +897,7 @@ def _recast(context: Context, values: list[Any], element: Type, site: int) -> li
         inner = partial(_recast, context, element=element.element, site=site)
         return vectors.recast_each(context, values, inner, site)
     signed = isinstance(element, value_types.IntegerType) and element.signed
-    to_bytes = vectors.signed if signed else vectors.unsigned
+    to_bytes = vectors.to_signed if signed else vectors.to_unsigned
     return vectors.recast(
         context, values, vectors.truths if isinstance(element, value_types.BoolType) else to_bytes, site
     )

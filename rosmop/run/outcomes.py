@@ -256,12 +256,12 @@ class Fault:
     over: bool = False
 
 
-def named(verdict: Verdict) -> str:
-    name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){bound(verdict)}"
+def label_of(verdict: Verdict) -> str:
+    name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){binding(verdict)}"
     return f"{name}: {verdict.category}"
 
 
-def bound(verdict: Verdict) -> str:
+def binding(verdict: Verdict) -> str:
     if not verdict.binding:
         return ""
     return f" with {', '.join(f'{name} = {value}' for name, value in verdict.binding.items())}"
@@ -324,7 +324,7 @@ class Outcome:
             for start, old in reversed(self.overwritten):
                 buffer[start : start + len(old)] = old
 
-    def sent(self) -> Iterator[Published]:
+    def sent_messages(self) -> Iterator[Published]:
         """Yield published messages as they go out: changed by later monitors, and without those that were dropped.
 
         Calls of services are included; their requests go through the monitors when they are sent.
@@ -426,7 +426,7 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
         "events": list(outcome.events),
         **({"timer": outcome.timer} if outcome.timer is not None else {}),
         **({"conditions": outcome.conditions} if outcome.looked else {}),
-        **({"handler": named(handled), **why_of(handled, who)} if handled is not None else {}),
+        **({"handler": label_of(handled), **why_of(handled, who)} if handled is not None else {}),
     }
 
 

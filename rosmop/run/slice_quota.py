@@ -30,12 +30,12 @@ class Quota(Generic[Thing]):
         self.total = 0
         self._of: dict[Holder, OrderedDict[Thing, None]] = {}
 
-    def held(self, holder: Holder) -> int:
+    def held_by(self, holder: Holder) -> int:
         return len(self._of.get(holder, ()))
 
     def fits(self, holder: Holder, more: int) -> bool:
         left = self.whole - self.total - more
-        return left >= 0 and (holder is None or self.held(holder) + more <= max(left, 1))
+        return left >= 0 and (holder is None or self.held_by(holder) + more <= max(left, 1))
 
     def take(self, holder: Holder, thing: Thing) -> None:
         self._of.setdefault(holder, OrderedDict())[thing] = None

@@ -299,10 +299,10 @@ class Slices:
                 if joined not in wanted and joined[1] not in self._known[joined[0]].slices:
                     wanted.add(joined)
                     order.append(joined)
-        found = (self._derived(into, values, len(order)) for into, values in order)
+        found = (self._derive(into, values, len(order)) for into, values in order)
         return [slice_ for slice_ in found if slice_ is not None]
 
-    def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
+    def _derive(self, domain: int, key: Key, most: int) -> Slice | None:
         values = dict(zip(_members(domain), key[1:], strict=True))
         parent: Slice | None = self._first
         for other in sorted(self._known, key=int.bit_count, reverse=True):
@@ -324,10 +324,10 @@ class Slices:
                 for declared, run in zip(self._properties, parent.runs, strict=True)
             )
         else:
-            runs = tuple(map(self._copied, self._looked_at(parent).runs))
+            runs = tuple(map(self._copy, self._looked_at(parent).runs))
         return Slice(domain, key, runs, parent.values, self._holder)
 
-    def _copied(self, run: Run) -> Run:
+    def _copy(self, run: Run) -> Run:
         if isinstance(run, BoundedRun):
             self._turn.check(COPY_COST * run.waiting, COPY_COST * run.waiting)
         return copy(run)
@@ -335,11 +335,11 @@ class Slices:
     def _full(self) -> str:
         if self._holder is None:
             return f"more than {self.limit} slices"
-        held = self.quota.held(self._holder)
+        held = self.quota.held_by(self._holder)
         return f"its host has {held} of {self.limit} slices, as many as are left for all other hosts"
 
     def _has_room(self, most: int) -> bool:
-        return self.quota.fits(self._holder, most) or (self._forgets and self.quota.held(self._holder) > 0)
+        return self.quota.fits(self._holder, most) or (self._forgets and self.quota.held_by(self._holder) > 0)
 
     def _refuse(self, domain: int, key: Key, why: str) -> None:
         self.refused, self.why = self._shown(domain, key), why
@@ -387,7 +387,7 @@ class Slices:
         """Undo the end of a slice whose last deadline is not concluded yet, unless its binding has begun again."""
         self._undo_end(slice_)
 
-    def forgotten(self, time_ns: int) -> str:
+    def report_forgotten(self, time_ns: int) -> str:
         """Report the slices forgotten for newer ones of the same host, at most once in `FOLDED_NS`."""
         number = self._forgotten
         if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
@@ -585,7 +585,7 @@ class Slices:
 
     def _remember(self, domain: int, key: Key, holder: Holder) -> None:
         while not self._ended.fits(holder, 1):
-            if not self._ended.held(holder):
+            if not self._ended.held_by(holder):
                 if key in self._known[domain].slices:
                     self._forget(domain, key)
                 return

@@ -19,7 +19,7 @@ from rosmop.form.compiled import Compiled
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.monitor import CellNames, MonitorInstance
 from rosmop.run.origins import Origin
-from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
+from rosmop.run.state_of_runs import StateTooLargeError, dump, run_of
 from rosmop.run.state_of_slices import PartSnapshot, SliceSnapshot, restore_slices
 from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
@@ -59,14 +59,14 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
     nodes that have a say of their own."""
 
 
-def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
+def encode(states: Sequence[MonitorSnapshot]) -> bytes:
     data = msgspec.msgpack.encode(states)
     if len(data) > MAX_STATE_BYTES:
         raise StateTooLargeError(f"its state has {len(data)} bytes; {MAX_STATE_BYTES} are kept")
     return data
 
 
-def refused(why: str) -> bytes:
+def encode_refusal(why: str) -> bytes:
     return msgspec.msgpack.encode(why)
 
 
@@ -144,7 +144,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Value], types
         monitor.held,
         monitor.why_held,
         [TimerSnapshot(timer.due, timer.ticked) for timer in monitor.timers],
-        [kept(running.run) for running in monitor.properties] if slices is None else [],
+        [dump(running.run) for running in monitor.properties] if slices is None else [],
         {name: variables[code] for name, code in monitor.code.variables.items()},
         first,
         {
@@ -157,7 +157,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Value], types
 def shape(monitor: MonitorInstance, variables: Mapping[str, Value]) -> bytes:
     monitor.move_to_python()
     runs = [
-        kept(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else kept(running.run)
+        dump(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else dump(running.run)
         for running in monitor.properties
     ]
     live = monitor.slices.live if monitor.slices is not None else 0

@@ -31,14 +31,14 @@ class StateTooLargeError(Exception):
     """A state has too many parts or bytes."""
 
 
-def kept(run: Run) -> list[list[object]]:
+def dump(run: Run) -> list[list[object]]:
     if isinstance(run, FiniteRun | ClockedRun):
-        return [[*run.saved()], []]
-    return _Writer(run).written()
+        return [[*run.save()], []]
+    return _Writer(run).write()
 
 
 def run_of(compiled: CompiledProperty, data: object, time_ns: int) -> Run:
-    """Read the data of `kept`. Raises `ValueError`."""
+    """Read the data of `dump`. Raises `ValueError`."""
     run = compiled.start(time_ns)
     try:
         _Reader(compiled, run, data).read()
@@ -59,10 +59,10 @@ class _Writer:
             else {}
         )
 
-    def written(self) -> list[list[object]]:
+    def write(self) -> list[list[object]]:
         run = self._run
         fields = [
-            *map(self._value, run.saved()),
+            *map(self._value, run.save()),
             *([self._operators_of(run)] if isinstance(run, BoundedRun) else []),
         ]
         parts: list[object] = []
@@ -73,12 +73,12 @@ class _Writer:
         return [fields, parts]
 
     def _operators_of(self, run: BoundedRun) -> list[object]:
-        return [[number, *map(self._value, operator.saved())] for number, operator in run.operators.items()]
+        return [[number, *map(self._value, operator.save())] for number, operator in run.operators.items()]
 
     def _part(self, part: Any) -> list[object]:
         if isinstance(part, EarleyShape):
             return ["shape", *map(self._value, (part.items, part.done, part.width))]
-        return [_NAMES[type(part)], *map(self._value, part.saved())]
+        return [_NAMES[type(part)], *map(self._value, part.save())]
 
     def _value(self, value: Any) -> object:
         if value is None or isinstance(value, bool | float | str):
@@ -108,7 +108,7 @@ class _Reader:
         self._parts: list[Any] = []
 
     def read(self) -> None:
-        self._parts = [self._made(entry) for entry in self._entries]
+        self._parts = [self._make(entry) for entry in self._entries]
         for part, (name, *fields) in zip(self._parts, self._entries, strict=True):
             if name != "shape":
                 self._fill(part, fields)
@@ -125,10 +125,10 @@ class _Reader:
     def _check(self, run: FiniteRun | ClockedRun) -> None:
         compiled: Any = self._compiled
         states = len(compiled.automaton) if isinstance(run, FiniteRun) else len(compiled.moves)
-        if not all(isinstance(value, int) for value in run.saved()) or not 0 <= run.state < states:
+        if not all(isinstance(value, int) for value in run.save()) or not 0 <= run.state < states:
             raise ValueError("the property has no such state")
 
-    def _made(self, entry: list[Any]) -> Any:
+    def _make(self, entry: list[Any]) -> Any:
         if entry[0] != "shape":
             made = object.__new__(_PARTS[entry[0]])
             if isinstance(made, FormulaCell):
@@ -147,9 +147,9 @@ class _Reader:
 
     def _fill_run(self, fields: list[object]) -> None:
         """Fill the run with values of the types that it has; only a grammar's frame may become None."""
-        before = self._run.saved()
+        before = self._run.save()
         self._fill(self._run, fields)
-        for first, value in zip(before, self._run.saved(), strict=True):
+        for first, value in zip(before, self._run.save(), strict=True):
             if not isinstance(value, type(first)) and not (value is None and isinstance(first, EarleySet)):
                 raise ValueError("a property has no such state")
 

@@ -10,7 +10,7 @@ import msgspec
 
 from rosmop.form.compiled import SpecificationCode
 from rosmop.run.slices import Binding, Slice, Slices, of_nan
-from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
+from rosmop.run.state_of_runs import StateTooLargeError, dump, run_of
 from rosmop.types.value_types import Type, Value
 
 BUCKETS = 128
@@ -53,7 +53,7 @@ class SliceParts:
         self._failed: list[dict[Binding, str]] = [{} for _ in range(BUCKETS)]
         slices.keep()
 
-    def changed(self) -> dict[int, bytes]:
+    def changed_parts(self) -> dict[int, bytes]:
         """Return the changed parts by number. A part with a slice that is too large to be saved is the reason."""
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
@@ -68,7 +68,7 @@ class SliceParts:
         return {number: self._encode(number) for number in dirty}
 
     def all(self) -> list[bytes]:
-        self.changed()
+        self.changed_parts()
         return [self._encode(number) for number in range(BUCKETS)]
 
     def _take(
@@ -86,7 +86,7 @@ class SliceParts:
         domain, key = binding
         state: tuple[Any, ...] = ()
         if slice_ is not None:
-            state = [*map(kept, slice_.runs)], [*slice_.values], slice_.due, slice_.turn
+            state = [*map(dump, slice_.runs)], [*slice_.values], slice_.due, slice_.turn
         record = SliceSnapshot(number, domain, [*key[1:]], holder, ended, *state)
         part[binding] = number, ended, msgspec.Raw(msgspec.msgpack.encode(record))
 

@@ -250,12 +250,12 @@ class Context:
     def _measure(self, size: int, site: int) -> None:
         """Measure the live values. It costs nothing, as it depends on earlier messages: `allocate` has paid for it."""
         held = size + sum(len(message.data) for message in self.turn.published)
-        held += sum(map(self._held, self._live()))
+        held += sum(map(self._bytes_held, self._live()))
         self._allocated = 0
         if held > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: {held} bytes")
 
-    def _held(self, variables: Mapping[str, object]) -> int:
+    def _bytes_held(self, variables: Mapping[str, object]) -> int:
         measures = self._measures
         return sum(measures[name](value) for name, value in variables.items() if name in measures)
 

@@ -71,9 +71,7 @@ def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
     return b"".join(pieces)
 
 
-def formatted(
-    context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int
-) -> bytes:
+def render(context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int) -> bytes:
     size += sum(len(argument) for argument in arguments if isinstance(argument, bytes))
     if size > _LONG:
         context.allocate(size, site)

@@ -23,17 +23,17 @@ _WHOLE = 1.5 * 2.0**52  # adding and subtracting it rounds to a whole number
 
 def sin(x: float) -> float:
     if fabs(x) <= LARGEST:
-        return _turned(x, 0.0)
+        return _turn(x, 0.0)
     return math.sin(x) if math.isfinite(x) else math.nan
 
 
 def cos(x: float) -> float:
     if fabs(x) <= LARGEST:
-        return _turned(x, 1.0)
+        return _turn(x, 1.0)
     return math.cos(x) if math.isfinite(x) else math.nan
 
 
-def _turned(x: float, quarters: float) -> float:
+def _turn(x: float, quarters: float) -> float:
     # Subtract `turns` right angles in three steps: each has 33 bits of a right angle, and the rest.
     turns = (x * 6.36619772367581382433e-01 + _WHOLE) - _WHOLE
     first = turns * 1.57079632673412561417e00

@@ -28,7 +28,7 @@ def _behind_stamp(buffer: bytes | bytearray | memoryview) -> tuple[bytes, bytes]
     return bytes(buffer[first:end]), bytes(buffer[end:])
 
 
-def sent(safe: SafeMessage, time_ns: int) -> bytes:
+def to_bytes(safe: SafeMessage, time_ns: int) -> bytes:
     if not safe.stamped:
         return safe.data
     seconds, nanoseconds = divmod(max(0, time_ns), 1_000_000_000)

@@ -78,7 +78,7 @@ def substring(context: Context, text: bytes, start: int, count: int, site: int) 
 
 def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
     context.spend((len(text) + len(wanted)) // 16, site)
-    found = _found(text, wanted, start) if start <= len(text) else -1
+    found = _find(text, wanted, start) if start <= len(text) else -1
     return NOT_FOUND if found < 0 else found
 
 
@@ -88,12 +88,12 @@ def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: in
     if len(wanted) <= _LONG:
         found = head.rfind(wanted)
     else:
-        found = _found(head[::-1], wanted[::-1], 0)
+        found = _find(head[::-1], wanted[::-1], 0)
         found = len(head) - found - len(wanted) if found >= 0 else -1
     return NOT_FOUND if found < 0 else found
 
 
-def _found(text: bytes, wanted: bytes, start: int) -> int:
+def _find(text: bytes, wanted: bytes, start: int) -> int:
     """Return `text.find(wanted, start)`.
 
     The times of `find` and `rfind` can grow with the product of the lengths, but not that of `find` in a text that is
@@ -117,7 +117,7 @@ def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int
     return NOT_FOUND
 
 
-def charged(context: Context, text: bytes, site: int) -> bytes:
+def charge(context: Context, text: bytes, site: int) -> bytes:
     if len(text) > _LONG:
         context.spend(len(text) // BYTES_PER_INSTRUCTION, site)
     return text
@@ -156,10 +156,10 @@ def replace(context: Context, text: bytes, start: int, count: int, added: bytes,
 def shorten(context: Context, text: bytes, site: int) -> bytes:
     if not text:
         raise FaultError(site, "pop_back of an empty string")
-    return charged(context, text, site)[:-1]
+    return charge(context, text, site)[:-1]
 
 
-def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
+def fill(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
     """A `char` buffer after `strcpy(buffer, text)`."""
     _allocate(context, buffer, site)
     copied = _cut(text) + b"\0"
@@ -179,22 +179,22 @@ def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, sit
     return copied + b"\0" * (count - len(copied)) + buffer[count:]
 
 
-def printed(context: Context, buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
-    return filled(context, buffer, text[: limit - 1], site) if limit else buffer
+def print_into(context: Context, buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
+    return fill(context, buffer, text[: limit - 1], site) if limit else buffer
 
 
-def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
+def extend_buffer(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
     """A `char` buffer after `strcat(buffer, text)`."""
     _allocate(context, buffer, site)
-    return filled(context, buffer, _cut(buffer) + _cut(text), site)
+    return fill(context, buffer, _cut(buffer) + _cut(text), site)
 
 
-def zeroed(context: Context, text: bytes, site: int) -> bytes:
-    return charged(context, text, site) + b"\0"
+def with_zero(context: Context, text: bytes, site: int) -> bytes:
+    return charge(context, text, site) + b"\0"
 
 
-def terminated(context: Context, buffer: bytes, site: int) -> bytes:
-    return _cut(charged(context, buffer, site))
+def until_zero(context: Context, buffer: bytes, site: int) -> bytes:
+    return _cut(charge(context, buffer, site))
 
 
 def _string(text: bytes) -> str:

@@ -30,7 +30,7 @@ def nanoseconds(seconds: float, site: int) -> int:
     return whole * BILLION + math.floor((seconds - whole) * 1e9 + 0.5)
 
 
-def scaled(value: int, factor: float, site: int) -> int:
+def scale(value: int, factor: float, site: int) -> int:
     return duration(nanoseconds(value / 1e9 * factor, site), site)
 
 

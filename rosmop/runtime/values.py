@@ -165,7 +165,7 @@ class ValueCodec:
             return lambda _context, value, _site: value
         width, element = self.width(kind.element), self.copier(kind.element)
         if value_types.is_scalar(kind.element):
-            return lambda context, values, site: vectors.copied(context, values, width, site)
+            return lambda context, values, site: vectors.copy(context, values, width, site)
         return lambda context, values, site: vectors.copied_deep(context, values, width, element, site)
 
     # In a message
@@ -261,7 +261,7 @@ class ValueCodec:
             if length is None:
                 out += struct.pack("<I", len(values))
             else:
-                vectors.fixed(values, length, -1)
+                vectors.require_count(values, length, -1)
             if encode is not None:
                 for value in vectors.in_parts(values, self._check):
                     encode(value, out)
@@ -310,10 +310,10 @@ def packer(codes: Sequence[str]) -> Callable[[Sequence[float]], bytes]:
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)
 
-    def packed(values: Sequence[float]) -> bytes:
+    def pack_values(values: Sequence[float]) -> bytes:
         parts: list[float] = []
         for code, value in zip(codes, values, strict=True):
             parts += divmod(value, BILLION) if len(code) == 2 else (value,)
         return pack(*parts)
 
-    return packed
+    return pack_values

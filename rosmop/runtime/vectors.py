@@ -47,7 +47,7 @@ def append_text(context: Context, values: Values, value: bytes, width: int, site
     values.append(value)
 
 
-def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
+def charge(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
     size = measure(values)
     if size > LARGE:
         context.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -68,7 +68,7 @@ def pop(values: Values, site: int) -> None:
     values.pop()
 
 
-def copied(context: Context, values: Values, width: int, site: int) -> Values:
+def copy(context: Context, values: Values, width: int, site: int) -> Values:
     context.allocate(len(values) * width, site)
     return values.copy()
 
@@ -94,11 +94,11 @@ def recast_each(
     return [convert(value) for value in values]
 
 
-def signed(values: list[int]) -> list[int]:
+def to_signed(values: list[int]) -> list[int]:
     return memoryview(bytes(values)).cast("b").tolist()
 
 
-def unsigned(values: list[int]) -> list[int]:
+def to_unsigned(values: list[int]) -> list[int]:
     return list(struct.pack(f"{len(values)}b", *values))
 
 
@@ -106,13 +106,13 @@ def truths(values: Values) -> list[bool]:
     return list(map(bool, values))
 
 
-def filled(context: Context, count: int, make: Callable[[], Value], width: int, site: int) -> Values:
+def fill(context: Context, count: int, make: Callable[[], Value], width: int, site: int) -> Values:
     context.allocate(count * width, site)
     context.spend(count // 4, site)
-    return _made(context, count, make)
+    return _make(context, count, make)
 
 
-def _made(context: Context, count: int, make: Callable[[], Value]) -> Values:
+def _make(context: Context, count: int, make: Callable[[], Value]) -> Values:
     values: Values = []
     for first in range(0, count, PART):
         context.turn.check()
@@ -120,17 +120,17 @@ def _made(context: Context, count: int, make: Callable[[], Value]) -> Values:
     return values
 
 
-def resized(  # noqa: PLR0917  the arguments are C++'s
+def resize(  # noqa: PLR0917  the arguments are C++'s
     context: Context, values: Values, count: int, make: Callable[[], Value], width: int, site: int
 ) -> None:
     more = count - len(values)
     if more <= 0:
         del values[count:]
         return
-    values += filled(context, more, make, width, site)
+    values += fill(context, more, make, width, site)
 
 
-def assigned(values: Values, others: Values) -> Values:
+def assign(values: Values, others: Values) -> Values:
     values[:] = others
     return values
 
@@ -145,10 +145,10 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
 ) -> Values:
     context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)
-    return _made(context, count, lambda: copy(value))
+    return _make(context, count, lambda: copy(value))
 
 
-def fixed(values: Values, count: int, site: int) -> Values:
+def require_count(values: Values, count: int, site: int) -> Values:
     if len(values) != count:
         raise FaultError(site, f"{counted(len(values), 'element')} for an array of exactly {count}")
     return values

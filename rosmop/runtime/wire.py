@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from rosmop.form.nodes import SafeMessage
 from rosmop.runtime.action_context import PART, Context, MalformedError
-from rosmop.runtime.safe_messages import HEAD, sent
+from rosmop.runtime.safe_messages import HEAD, to_bytes
 from rosmop.runtime.times import with_part
 from rosmop.types.value_types import Value
 from roswire.counted import counted
@@ -251,7 +251,7 @@ class WireMessage:
     def stop(self, safe: SafeMessage, site: int) -> None:
         """Replace the message with a safe message; a header keeps its `seq` and `stamp`."""
         first = HEAD if safe.stamped and len(self.buffer) >= HEAD else 0
-        new = safe.data[first:] if first else sent(safe, self.time)
+        new = safe.data[first:] if first else to_bytes(safe, self.time)
         self.splice([(first, len(self.buffer), new, 0)])
         self.stopped = site
 

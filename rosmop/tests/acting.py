@@ -21,7 +21,7 @@ PAINTBALL = "uint8 NONE=0\nuint8 SINGLE_SHOT=1\nHeader header\nuint8 trigger\n"
 
 @functools.cache
 def definitions() -> Definitions:
-    return standard_definitions().extended(
+    return standard_definitions().merge(
         Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": PAINTBALL})
     )
 

@@ -10,7 +10,7 @@ from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.fast_path import FastLane
-from rosmop.run.outcomes import Verdict, named
+from rosmop.run.outcomes import Verdict, label_of
 from rosmop.runtime.action_context import LogLine, Published
 from rosmop.tests.interpreted import beside
 from rosmop.tests.on_module import on_module
@@ -75,8 +75,8 @@ class BothWays:
         self._inside = not self._inside
         told, self.lines, self.published = len(self.told), [], []
         assert self._fed(frames(bodies), topic, time) == frames(expected)
-        assert self.counts + Counter(map(named, self.told[told:])) == Counter(
-            map(named, self.interpreted[began:])
+        assert self.counts + Counter(map(label_of, self.told[told:])) == Counter(
+            map(label_of, self.interpreted[began:])
         )
         assert self.lines == lines
         assert self.published == published
@@ -102,7 +102,7 @@ class BothWays:
                 prepared = lane.prepare(loud=False, told=(), counted=counted)
                 walked = lane.process_batch(view, position, run, pieces, time, prepared)
                 for verdict, count in zip(lane.verdicts, walked.told if walked else (), strict=False):
-                    self.counts[named(verdict)] += count
+                    self.counts[label_of(verdict)] += count
                 self.lines += (line for _, line in walked.output) if walked else ()
                 position, run = (len(view), run) if walked is None else (walked.position, walked.run)
                 self.came["together"] += position > before

@@ -63,7 +63,7 @@ _HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; 
 
 
 def definitions() -> Definitions:
-    return acting.definitions().extended(OWN)
+    return acting.definitions().merge(OWN)
 
 
 @dataclass(frozen=True)

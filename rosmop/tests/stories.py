@@ -25,7 +25,7 @@ import pytest
 
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import Outcome, bound
+from rosmop.run.outcomes import Outcome, binding
 from rosmop.tests import acting
 from rosmop.tests.interpreted import beside
 from rosmop.tests.on_module import on_module
@@ -203,7 +203,7 @@ def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str
     head += f" ({outcome.reason})" if outcome.reason else ""
     lines += [head] * bool(kind or outcome.timer)
     lines += [
-        f"    {verdict.monitor} {verdict.property + 1} {verdict.logic}{bound(verdict)}: {verdict.category}"
+        f"    {verdict.monitor} {verdict.property + 1} {verdict.logic}{binding(verdict)}: {verdict.category}"
         for verdict in outcome.verdicts
     ]
     lines += [f"    {one.level} {one.monitor}: {one.text}" for one in outcome.log]

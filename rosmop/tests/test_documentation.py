@@ -9,7 +9,7 @@ from rosmop.check.members import TEXT_METHODS, TIME_METHODS
 from rosmop.check.sources import compiled_from
 from rosmop.check.standard_functions import LIBRARY
 from rosmop.check.vector_members import VECTOR_METHODS
-from rosmop.fast.build import certified, require_loadable
+from rosmop.fast.build import certify, require_loadable
 from rosmop.runtime.action_context import BUDGET, MAX_BYTES, MAX_CALLS
 from rosmop.runtime.numbers import MATH
 from rosmop.tests.acting import definitions, load
@@ -62,7 +62,7 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
     ],
 )
 def test_every_sample_is_loaded_as_a_relay_loads_it(text: str) -> None:
-    require_loadable(certified(compiled_from({"sample.rv": text}, definitions())).data)
+    require_loadable(certify(compiled_from({"sample.rv": text}, definitions())).data)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_every_sample_is_loaded_as_a_relay_loads_it(text: str) -> None:
 def test_helpers_that_return_any_type_are_loaded(kind: str) -> None:
     helper = f"{kind} of({kind} x) {{ return x; }} {kind} kept;"
     text = in_specification(helper, "kept = of(kept); if (v > 1) { return; }")
-    require_loadable(certified(compiled_from({"sample.rv": text}, definitions())).data)
+    require_loadable(certify(compiled_from({"sample.rv": text}, definitions())).data)
 
 
 def row(head: str) -> str:

@@ -280,7 +280,7 @@ def test_large_batches_are_processed_in_pieces(monkeypatch: pytest.MonkeyPatch) 
     many = [plain(number) for number in range(MAX_EFFECTS + AREA // 20)]
     both.check(many)
     assert both.came["together"] == 1
-    assert [*both.lane().happened()] == [len(many)] * 2
+    assert [*both.lane().take_events()] == [len(many)] * 2
 
 
 # State
@@ -314,7 +314,7 @@ def test_events_and_drops_are_counted() -> None:
     assert walked is not None
     assert (walked.position, walked.run, [*walked.dropped]) == (6 * size, 6 * size, [0, 3])
     assert [bytes(piece) for piece in pieces] == [bytes(view[: 2 * size]), bytes(view[4 * size : 5 * size])]
-    assert [[*lane.happened()] for _ in range(2)] == [[6, 4], [0, 0]]
+    assert [[*lane.take_events()] for _ in range(2)] == [[6, 4], [0, 0]]
 
 
 # The remaining messages, and their time

@@ -88,7 +88,7 @@ def shipped() -> MonitorSet:
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
-    return MonitorSet.of(compiled_from(sources, standard_definitions().extended(own)))
+    return MonitorSet.of(compiled_from(sources, standard_definitions().merge(own)))
 
 
 def a_value(values: ValueCodec, kind: value_types.Type) -> st.SearchStrategy[Any]:

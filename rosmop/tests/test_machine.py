@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosmop.fast import wasm_instance
-from rosmop.fast.wasm_instance import PAGE, WasmError, WasmInstance, WasmTrap, translated
+from rosmop.fast.wasm_instance import PAGE, WasmError, WasmInstance, WasmTrap, translate
 from rosmop.tests.examples import examples
 
 LIMIT = 4 * PAGE
@@ -34,7 +34,7 @@ TRAPS = {
 
 
 def run(code: bytes, limit: int = LIMIT) -> WasmInstance:
-    return WasmInstance(translated(code, limit), limit)
+    return WasmInstance(translate(code, limit), limit)
 
 
 def made(text: str, limit: int = LIMIT, pages: str = "1") -> WasmInstance:
@@ -177,7 +177,7 @@ def test_other_threads_go_on_while_a_module_is_translated() -> None:
 
     def work() -> None:
         began = time.thread_time()
-        translated(code, LIMIT)
+        translate(code, LIMIT)
         taken.append(time.thread_time() - began)
 
     thread, began = threading.Thread(target=work), time.thread_time()

@@ -17,7 +17,7 @@ FAST = message("geometry_msgs/TwistStamped", twist__linear__x=9.0)
 
 
 def speeds(outcome: Outcome) -> list[float]:
-    return [fields("geometry_msgs/Twist", one.data).linear.x for one in outcome.sent()]
+    return [fields("geometry_msgs/Twist", one.data).linear.x for one in outcome.sent_messages()]
 
 
 def test_a_cap_limits_what_a_mux_publishes() -> None:

@@ -12,7 +12,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.run import state_of_runs
 from rosmop.run.engine import MonitorSet
 from rosmop.run.state import states_of
-from rosmop.run.state_of_runs import MAX_PARTS, StateTooLargeError, kept, run_of
+from rosmop.run.state_of_runs import MAX_PARTS, StateTooLargeError, dump, run_of
 from rosmop.tests.examples import examples
 from roswire.standard import standard_definitions
 
@@ -66,7 +66,7 @@ def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
 
 
 def again(formula: Any, run: Any) -> Any:
-    return run_of(formula, msgspec.msgpack.decode(msgspec.msgpack.encode(kept(run))), 0)
+    return run_of(formula, msgspec.msgpack.decode(msgspec.msgpack.encode(dump(run))), 0)
 
 
 @pytest.mark.parametrize("name", FORMULAS)
@@ -83,7 +83,7 @@ def test_a_deep_stack_is_too_large_to_keep() -> None:
     for _ in range(2 * MAX_PARTS):
         run.step(0, 0)
     with pytest.raises(StateTooLargeError):
-        kept(run)
+        dump(run)
 
 
 def test_a_slice_that_is_too_large_loses_only_the_state_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,7 +43,7 @@ def drive(monitors: MonitorSet, data: bytes, time: int = 5) -> bytes:
 
 
 def sent(outcomes: list[Outcome]) -> list[Any]:
-    return [fields(one.type, one.data) for outcome in outcomes for one in outcome.sent()]
+    return [fields(one.type, one.data) for outcome in outcomes for one in outcome.sent_messages()]
 
 
 def test_a_stop_replaces_the_message_and_keeps_its_stamp() -> None:

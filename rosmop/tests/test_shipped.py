@@ -25,7 +25,7 @@ def shipped(*names: str, made: Callable[[Compiled], MonitorSet] = MonitorSet.of)
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {f"{name}.rv": (MONITORS / f"{name}.rv").read_text() for name in names}
-    monitors = made(compiled_from(sources, standard_definitions().extended(own)))
+    monitors = made(compiled_from(sources, standard_definitions().merge(own)))
     started = monitors.start(0)
     assert not started.faults
     return monitors

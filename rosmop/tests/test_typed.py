@@ -246,8 +246,8 @@ def test_old_files_may_use_the_new_words_as_names(word: str) -> None:
 
 
 def test_lists_are_read_and_written_in_one_form() -> None:
-    assert given_lists.normalised("corners", " 0,0  4 ,0 0, 3.5 ") == "0,0 4,0 0,3.5"
-    assert given_lists.normalised("hosts", "10.0.0.7 10.8.0.0/16") == "10.0.0.7/32 10.8.0.0/16"
+    assert given_lists.normalise("corners", " 0,0  4 ,0 0, 3.5 ") == "0,0 4,0 0,3.5"
+    assert given_lists.normalise("hosts", "10.0.0.7 10.8.0.0/16") == "10.0.0.7/32 10.8.0.0/16"
     assert (given_lists.joints("none"), given_lists.nanoseconds("0.5s")) == ((), 5 * 10**8)
 
 

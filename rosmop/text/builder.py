@@ -57,7 +57,7 @@ def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:
     return build
 
 
-def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
+def _make(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
     def build(self: "TreeBuilder", meta: Meta, *children: object) -> _T:
         given = (str(child) if isinstance(child, Token) else child for child in children[first:])
         return kind(self.at(meta), *given, **more)
@@ -253,7 +253,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
             self.refuse(meta, f"give the parameter a name: `{' '.join(words)} x`")
         return ()
 
-    parameter = _made(tree.ParameterDeclaration)
+    parameter = _make(tree.ParameterDeclaration)
 
     def reference_parameter(self, meta: Meta, kind: tree.TypeName, name: Token) -> tree.ParameterDeclaration:
         return tree.ParameterDeclaration(self.at(meta), _referenced(kind), str(name))
@@ -393,7 +393,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
         origin = self.at(formula).within(formula, len(formula) - len(stripped))
         return tree.Property(self.at(meta), str(logic), stripped.rstrip(), origin, tuple(handlers))
 
-    handler = _made(tree.Handler, 1)
+    handler = _make(tree.Handler, 1)
 
     # Types
 
@@ -414,7 +414,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     def pointer(self, meta: Meta, *words: Token) -> tree.TypeName:
         return tree.TypeName(self.at(meta), tuple(map(str, words)), pointer=True)
 
-    named = _made(tree.TypeName)
+    named = _make(tree.TypeName)
 
     def message(self, meta: Meta, name: Token) -> tree.TypeName:
         return tree.TypeName(self.at(meta), tuple(str(name).replace("::", "/").split("/")))
@@ -438,9 +438,9 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     def block(self, meta: Meta, *children: tree.Statement) -> tree.Block:
         return tree.Block(self.at(meta), children)
 
-    evaluate = _made(tree.ExpressionStatement)
-    if_ = _made(tree.IfStatement, 1)
-    while_ = _made(tree.WhileStatement, 1)
+    evaluate = _make(tree.ExpressionStatement)
+    if_ = _make(tree.IfStatement, 1)
+    while_ = _make(tree.WhileStatement, 1)
 
     def do_(
         self, meta: Meta, _: Token, body: tree.Statement, condition: tree.Expression
@@ -459,7 +459,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
         empty = isinstance(start, tree.Block)
         return tree.ForStatement(self.at(meta), None if empty else start, condition, step, body)
 
-    range_for = _made(tree.RangeForStatement, 1)
+    range_for = _make(tree.RangeForStatement, 1)
 
     def range_for_reference(
         self, meta: Meta, word: Token, kind: tree.TypeName, *more: Token | tree.SyntaxNode
@@ -479,12 +479,12 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     def default(self, meta: Meta, _: Token, *statements: tree.Statement) -> tree.SwitchCase:
         return tree.SwitchCase(self.at(meta), None, statements)
 
-    break_ = _made(tree.BreakStatement, 1)
-    continue_ = _made(tree.ContinueStatement, 1)
-    drop = _made(tree.DropStatement, 1)
-    stop = _made(tree.StopStatement, 1)
-    reset = _made(tree.ResetStatement, 1)
-    return_ = _made(tree.ReturnStatement, 1)
+    break_ = _make(tree.BreakStatement, 1)
+    continue_ = _make(tree.ContinueStatement, 1)
+    drop = _make(tree.DropStatement, 1)
+    stop = _make(tree.StopStatement, 1)
+    reset = _make(tree.ResetStatement, 1)
+    return_ = _make(tree.ReturnStatement, 1)
 
     def delete(self, meta: Meta, _: Token, target: tree.Expression) -> tree.DeleteStatement:
         return tree.DeleteStatement(self.at(meta), target)
@@ -502,8 +502,8 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     def declaration(self, meta: Meta, kind: tree.TypeName, *declarators: tree.Declarator) -> tree.Declaration:
         return tree.Declaration(self.at(meta), kind, declarators)
 
-    plain_declarator = _made(tree.Declarator)
-    initialized = _made(tree.Declarator)
+    plain_declarator = _make(tree.Declarator)
+    initialized = _make(tree.Declarator)
 
     def constructed(self, meta: Meta, name: Token, arguments: _Expressions) -> tree.Declarator:
         return tree.Declarator(self.at(meta), str(name), arguments=arguments)
@@ -545,7 +545,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     def set(self, meta: Meta, target: tree.Expression, value: tree.Expression) -> tree.Assignment:
         return tree.Assignment(self.at(meta), "=", target, value)
 
-    conditional = _made(tree.ConditionalExpression)
+    conditional = _make(tree.ConditionalExpression)
 
     def binary(
         self, meta: Meta, left: tree.Expression, operator: Token, right: tree.Expression
@@ -565,8 +565,8 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
     divide = _binary("/")
     remainder = _binary("%")
 
-    prefix = _made(tree.UnaryExpression)
-    step_before = _made(tree.IncrementExpression, prefix=True)
+    prefix = _make(tree.UnaryExpression)
+    step_before = _make(tree.IncrementExpression, prefix=True)
 
     def step_after(self, meta: Meta, target: tree.Expression, operator: Token) -> tree.IncrementExpression:
         return tree.IncrementExpression(self.at(meta), str(operator), target, prefix=False)
@@ -609,9 +609,9 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
             )
         return tree.NewExpression(self.at(meta), _child(children, tree.Expression))
 
-    limit = _made(tree.NumericLimit, 1)
-    index = _made(tree.IndexExpression)
-    member = _made(tree.MemberAccess)
+    limit = _make(tree.NumericLimit, 1)
+    index = _make(tree.IndexExpression)
+    member = _make(tree.MemberAccess)
 
     def call(
         self, meta: Meta, callee: tree.Expression, arguments: _Expressions | None

@@ -164,7 +164,7 @@ _SITUATIONS: tuple[tuple[Set[str], str, str], ...] = (
 )
 
 
-def shown(text: str) -> str:
+def quote(text: str) -> str:
     clean = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
     return f"`{clean if len(clean) <= 40 else clean[:37] + '…'}`"
 
@@ -182,18 +182,18 @@ def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
             ", expected a formula; a property is" if before.endswith(":") else " after the formula, expected"
         )
         form = "`logic: formula @category { … }`" if before.endswith(":") else "a handler `@category { … }`"
-        return offset, f"found {shown(piece)}{what} {form}"
+        return offset, f"found {quote(piece)}{what} {form}"
     advice = foreign(text, offset, len(_open_braces(text, offset)))
     if advice is not None:
         return advice[0], _refused(text, *advice)
     if "SEMICOLON" in accepted and "\n" in text[len(before) : offset] and before[-1:] not in "{};":
         line = text.count("\n", 0, offset) + 1
-        return len(before), f"expected `;` after this, found {shown(piece)} in line {line}"
+        return len(before), f"expected `;` after this, found {quote(piece)} in line {line}"
     hint = _hint(text[:offset], piece, accepted)
-    return offset, f"found {shown(piece)}, expected {_expected(accepted)}" + (f"; {hint}" if hint else "")
+    return offset, f"found {quote(piece)}, expected {_expected(accepted)}" + (f"; {hint}" if hint else "")
 
 
-def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
+def explain_misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
     if word in FORBIDDEN:
         return offset, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
     opened = _open_braces(text, offset)
@@ -209,7 +209,7 @@ def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
 
 
 def _refused(text: str, begin: int, end: int, advice: str) -> str:
-    return f"{shown(' '.join(text[begin:end].split()))} is not part of the language; {advice}"
+    return f"{quote(' '.join(text[begin:end].split()))} is not part of the language; {advice}"
 
 
 def _hint(before: str, piece: str, accepted: Set[str]) -> str:

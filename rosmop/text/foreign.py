@@ -135,7 +135,7 @@ def _hexadecimal(found: re.Match[str]) -> str:
     return f"write `{value:#x}`"
 
 
-def _replaced(pattern: str, by: str, template: str = "write `{}`") -> Callable[[re.Match[str]], str]:
+def _replace(pattern: str, by: str, template: str = "write `{}`") -> Callable[[re.Match[str]], str]:
     return lambda found: template.format(re.sub(pattern, by, found[0].strip()))
 
 
@@ -162,11 +162,11 @@ _SHAPES = (
         "there are no pointers; declare the variable itself: it exists from the start",
     ),
     _shape(r"\b0[bB][01](?:'?[01])*", _hexadecimal),
-    _shape(r"\b0[oO][0-7]+", _replaced("[oO]", "")),
+    _shape(r"\b0[oO][0-7]+", _replace("[oO]", "")),
     _shape(r"\b0[xX][\da-fA-F]*\.?[\da-fA-F]*[pP][-+]?\d+", _as_float),
     _shape(
         r"\b\d[\da-fA-FxX]*(?:['_][\da-fA-F]+)+",
-        _replaced("['_]", "", "write `{}`; numbers have no separators"),
+        _replace("['_]", "", "write `{}`; numbers have no separators"),
     ),
     _shape(r"\b(?:\d+\.?\d*|\.\d+)[A-Za-z_]\w*", "names begin with a letter, and numbers have no units"),
     _shape(
@@ -176,7 +176,7 @@ _SHAPES = (
     _shape(r"\b(?:u8|[uUL])(?=[\"'])", "strings are bytes; leave it out"),
     _shape(
         r"'[^'\n{][^'\n]+'",
-        _replaced("'", '"', "a character literal is one character; write a string in double quotes, `{}`"),
+        _replace("'", '"', "a character literal is one character; write a string in double quotes, `{}`"),
         2,
     ),
     _shape(r"\[\[[^\[\]\n]*\]\]", "there are no attributes; leave it out"),
@@ -184,7 +184,7 @@ _SHAPES = (
         r"\[[&=\w\s,]*\]\s*(?=\([^()]*\)[^;]*\{|\{)",
         "there are no lambda functions; declare a helper function beside the events, and call it in a loop",
     ),
-    _shape(r"(?<![\w\])])\s*\[[^\[\]\n;]*\]", _replaced(r"^.(.*).$", r"{\1}"), 2),
+    _shape(r"(?<![\w\])])\s*\[[^\[\]\n;]*\]", _replace(r"^.(.*).$", r"{\1}"), 2),
     _shape(rf"\b(?:(?:std|boost)\s*::\s*)?(?P<template>{_TEMPLATE})\s*<[^;{{}}()]*", _of_template),
     _shape(
         rf"\b{_SCOPED}<[^;{{}}()]*>\s*::\s*(?:const_|reverse_|const_reverse_)?iterator\b",
@@ -203,7 +203,7 @@ _SHAPES = (
         "the only template is `std::vector<T>`",
     ),
     _shape(rf"\b{_SCOPED}::\s*\w+\s*\*+\s*\w+(?=\s*[=;,)])", _POINTERS),
-    _shape(rf"\b{_SCOPED}\s*->\s*\w+", _replaced(r"\s*->\s*", ".", "there are no pointers; write `{}`"), 2),
+    _shape(rf"\b{_SCOPED}\s*->\s*\w+", _replace(r"\s*->\s*", ".", "there are no pointers; write `{}`"), 2),
     _shape(
         r"\b(\w+)\s*::\s*(\w+?)(?:\s*::\s*)?(?:Const)?Ptr\b(?:\s*(?:const\s*)?&)?",
         lambda found: f"there are no pointers; write `{found[1]}::{found[2]}`",
@@ -218,10 +218,10 @@ _SHAPES = (
         2,
     ),
     _shape(rf"\b{_NOT_A_TYPE}{_TYPE}\s+\w+\s*\(\s*\)(?=\s*;)", "leave the `()` out", 2),
-    _shape(r"\(\s*[\w:]+\s*\)\s*(?=[\w\"])", _replaced(r"^.\s*(.*?)\s*.$", r"static_cast<\1>(…)"), 2),
+    _shape(r"\(\s*[\w:]+\s*\)\s*(?=[\w\"])", _replace(r"^.\s*(.*?)\s*.$", r"static_cast<\1>(…)"), 2),
     _shape(
         r"\b(?:int|bool|char|long|short|float|double|unsigned)\s*\{[^{};]*\}",
-        _replaced(r"\s*{(.*)}", r"(\1)"),
+        _replace(r"\s*{(.*)}", r"(\1)"),
         2,
     ),
     _shape(r"\bconst\s+\w+\s*=", "its type is missing: `const int NAME = …;`"),
@@ -235,7 +235,7 @@ _SHAPES = (
     _shape(r"(?<=\))\s*const\b", "functions do not belong to an object; leave `const` out", 1),
     _shape(r"\.\.\.", "write each value separately", 2),
     _shape(r"\bcase\b[^;:{}]*\.\.", "write each value separately", 2),
-    _shape(r"\b(?:DROP|__RESET)\s*\(\s*\)?", _replaced(r"\W.*", ";"), 2),
+    _shape(r"\b(?:DROP|__RESET)\s*\(\s*\)?", _replace(r"\W.*", ";"), 2),
     _shape(r"\belif\b[^;{}]*", "write `else if (…)`", 2),
     _shape(
         r"\b(?:foreach|BOOST_FOREACH|for)\s*\(?\s*(?:[\w:]+\s+)?\w+\s*(?:,|\bin\b|\bof\b)\s*\w*\)?",
@@ -246,7 +246,7 @@ _SHAPES = (
     _shape(
         r"\b(?:def|lambda)\b[^;{}\n]*", "declare a helper function, `double half(double x) { return x / 2; }`"
     ),
-    _shape(r"[!=]==", _replaced("=$", ""), 2),
+    _shape(r"[!=]==", _replace("=$", ""), 2),
     _shape(r"<=>|\?\?|\?:|\?\.|=>", "write `a ? b : c`, or `if (…) { … }`", 2),
     _shape(r":=", "write `=`", 2),
     _shape(r"\b(?:int|bool|char|long|short|float|double|unsigned|void)\s*\*\s*\*", _POINTERS),
@@ -268,11 +268,11 @@ _SHAPES = (
     ),
     _shape(
         r"\b[A-Za-z_]\w*(?:[-.]\w+)+(?=\s*[({])|\b\w+-\w+(?=\s)",
-        _replaced("[-.]", "_", "a name has letters, digits and `_`; write `{}`"),
+        _replace("[-.]", "_", "a name has letters, digits and `_`; write `{}`"),
         0,
         1,
     ),
-    _shape(r"\b([a-z]\w*)(?:/|::)msg(?:/|::)(\w+)", _replaced("msg(/|::)", ""), 1, 2),
+    _shape(r"\b([a-z]\w*)(?:/|::)msg(?:/|::)(\w+)", _replace("msg(/|::)", ""), 1, 2),
     _shape(
         r"\b(?!event\b)\w+\s+(\w+)\s*\([^()]*\)\s*(?=/|service\b|every\b)",
         lambda found: f"an event begins with `event`: write `event {found[1]}(…)`",

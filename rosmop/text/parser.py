@@ -11,8 +11,8 @@ from rosmop.form.findings import Position, SpecificationError
 from rosmop.logics.catalogue import LOGICS
 from rosmop.text import tree
 from rosmop.text.builder import TreeBuilder, check
-from rosmop.text.complaints import FORBIDDEN, RESERVED, describe, misplaced
-from rosmop.text.typed import made
+from rosmop.text.complaints import FORBIDDEN, RESERVED, describe, explain_misplaced
+from rosmop.text.typed import make_specifications
 from rosmop.types.roles import ROLES
 
 # The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
@@ -315,7 +315,7 @@ def parse(text: str, file: str) -> tree.SpecificationFile:
             start.within(text, broken.start()), "these bytes are not UTF-8; save the file as UTF-8"
         )
     _check_directives(text, file)
-    result = made(_build(text, file), roles)
+    result = make_specifications(_build(text, file), roles)
     if not result.specifications and not result.orders:
         raise SpecificationError.at(
             start, "there is no specification in this file; write `name() { event … }`"
@@ -342,7 +342,7 @@ def _parse(text: str, file: str) -> Tree[Token]:
     try:
         return _parser().parse(text)
     except _ForbiddenWordError as error:
-        begin, message = misplaced(text, error.token.start_pos or 0, str(error.token))
+        begin, message = explain_misplaced(text, error.token.start_pos or 0, str(error.token))
         raise SpecificationError.at(start_of(file, text, begin), message) from None
     except UnexpectedInput as error:
         at_end = isinstance(error, UnexpectedToken) and error.token.type == "$END"
@@ -355,7 +355,7 @@ def _parse(text: str, file: str) -> Tree[Token]:
                 "a comment ends at the first `*/`: here in `/*/`; write a space before its `/`, or use `//`"
             )
             raise SpecificationError.at(start_of(file, text, early), advice) from None
-        begin, message = describe(text, offset, _accepted(error))
+        begin, message = describe(text, offset, _accepted_tokens(error))
         raise SpecificationError.at(start_of(file, text, begin), message) from None
 
 
@@ -373,7 +373,7 @@ def start_of(file: str, text: str, offset: int) -> Position:
     return Position(file, 1, 1).within(text, offset)
 
 
-def _accepted(error: UnexpectedInput) -> set[str]:
+def _accepted_tokens(error: UnexpectedInput) -> set[str]:
     if isinstance(error, UnexpectedToken):
         return set(error.accepts)
     return set(error.allowed or ()) if isinstance(error, UnexpectedCharacters) else set()

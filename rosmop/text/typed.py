@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar, cast
 from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.text import tree
 from rosmop.types import given_lists
-from rosmop.types.messages import nearest, shown
+from rosmop.types.messages import nearest, quote
 from roswire.names import is_global_name
 
 _T = TypeVar("_T")
@@ -31,7 +31,7 @@ class _Chosen(NamedTuple):
     row: tree.RoleRow
 
 
-def made(typed: tree.TypedFile, shipped: Callable[[], Roles]) -> tree.SpecificationFile:
+def make_specifications(typed: tree.TypedFile, shipped: Callable[[], Roles]) -> tree.SpecificationFile:
     """Return the specifications with their types and values. Raises `SpecificationError` with all errors.
 
     `shipped()` returns the roles that each file has beside its own.
@@ -56,11 +56,11 @@ def _unknown_presets(typed: tree.TypedFile) -> Iterable[Diagnostic]:
     seen = set()
     for one in typed.presets:
         if one.preset not in names:
-            text = f"this file has no specification {shown(one.preset)}{nearest(one.preset, names)}"
+            text = f"this file has no specification {quote(one.preset)}{nearest(one.preset, names)}"
             yield Diagnostic(one.position, "error", text)
         if one.preset in seen:
             yield Diagnostic(
-                one.position, "error", f"{shown(one.preset)} has a `preset` statement; leave this one out"
+                one.position, "error", f"{quote(one.preset)} has a `preset` statement; leave this one out"
             )
         seen.add(one.preset)
 
@@ -69,7 +69,7 @@ def _repeated_roles(typed: tree.TypedFile) -> Iterable[Diagnostic]:
     seen = set()
     for role in typed.roles:
         if role.name in seen:
-            yield Diagnostic(role.position, "error", f"there is another role {shown(role.name)} in this file")
+            yield Diagnostic(role.position, "error", f"there is another role {quote(role.name)} in this file")
         seen.add(role.name)
 
 
@@ -91,7 +91,7 @@ class _Maker:
         settings: dict[str, tree.Setting] = {}
         for one in preset.settings if preset else ():
             if one.name in settings:
-                self._refuse(one.position, f"{shown(one.name)} is set twice")
+                self._refuse(one.position, f"{quote(one.name)} is set twice")
             settings[one.name] = one
         if isinstance(written, tree.TypedSpecification):
             self._check_names(written)
@@ -138,13 +138,13 @@ class _Maker:
         seen = set()
         for given in written.givens:
             if given.name in seen:
-                self._refuse(given.position, f"{shown(given.name)} is given twice")
+                self._refuse(given.position, f"{quote(given.name)} is given twice")
             seen.add(given.name)
 
     def _check_settings(self, settings: Mapping[str, tree.Setting], names: list[str]) -> None:
         for name, one in settings.items():
             if name not in names:
-                self._refuse(one.position, f"{shown(name)} is not given to it{nearest(name, names)}")
+                self._refuse(one.position, f"{quote(name)} is not given to it{nearest(name, names)}")
 
     # Givens
 
@@ -177,14 +177,14 @@ class _Maker:
     def _check_topic(self, name: str, topic: str, place: Position) -> None:
         if not is_global_name(topic):
             only = ", without a type" if is_global_name(topic.partition(" ")[0]) else ""
-            self._refuse(place, f"{shown(topic)} is not a topic; write it like {name} = /cmd_vel{only}")
+            self._refuse(place, f"{quote(topic)} is not a topic; write it like {name} = /cmd_vel{only}")
 
     def _constant(self, node: tree.GivenValue, setting: tree.Setting) -> str:
         value = setting.value
         if node.type == ("bool",):
             if value not in ("true", "false"):
                 self._refuse(
-                    setting.position, f"{shown(value)}: write {node.name} = true or {node.name} = false"
+                    setting.position, f"{quote(value)}: write {node.name} = true or {node.name} = false"
                 )
                 return node.default
             return value
@@ -194,7 +194,7 @@ class _Maker:
             unit = " without its unit" if node.unit else ""
             self._refuse(
                 setting.position,
-                f"{shown(value)}: write a number{unit}, such as {node.name} = {node.default}",
+                f"{quote(value)}: write a number{unit}, such as {node.name} = {node.default}",
             )
             return node.default
 
@@ -210,7 +210,7 @@ class _Maker:
             return
         row = rows.get(kind) or (rows.get("") if kind else None)
         if row is None:
-            text = f"{topic} cannot have the type {shown(kind)}; {role.name} has {', '.join(rows)}"
+            text = f"{topic} cannot have the type {quote(kind)}; {role.name} has {', '.join(rows)}"
             self._refuse(place, text)
             return
         self.topics[node.name] = _Chosen(topic, kind, role, row)
@@ -223,7 +223,7 @@ class _Maker:
             role = roles.get(name)
             if role is None or role in chain:
                 why = "there is no role" if role is None else "there is a circle of roles with"
-                self._refuse(place, f"{why} {shown(name)}{'' if role else nearest(name, roles)}")
+                self._refuse(place, f"{why} {quote(name)}{'' if role else nearest(name, roles)}")
                 return None
             chain.insert(0, role)
             name, place = role.base, role.position
@@ -256,7 +256,7 @@ class _Maker:
         except ValueError as error:
             why = f"{error}; " if str(error) else ""
             self._refuse(
-                place, f"{shown(value)}: {why}write it like {name} = {given_lists.EXAMPLES[node.kind]}"
+                place, f"{quote(value)}: {why}write it like {name} = {given_lists.EXAMPLES[node.kind]}"
             )
 
     def _table(self, node: tree.GivenList, of: str, name: str, cells: Iterable[str]) -> None:
@@ -273,7 +273,7 @@ class _Maker:
             return node
         networks = self.hosts.get(names[0].parts[0])
         if networks is None:
-            self._refuse(names[0].position, f"no `hosts` {shown(names[0].parts[0])} are given to it")
+            self._refuse(names[0].position, f"no `hosts` {quote(names[0].parts[0])} are given to it")
             return node
         return replace(node, networks=(), given=networks)
 
@@ -282,7 +282,7 @@ class _Maker:
     def _topic(self, name: str, place: Position) -> _Chosen | None:
         if name not in self.topics and not self.findings:
             self._refuse(
-                place, f"{shown(name)} has no role here: write its type, or `topic {name} : Role = /topic;`"
+                place, f"{quote(name)} has no role here: write its type, or `topic {name} : Role = /topic;`"
             )
         return self.topics.get(name)
 
@@ -304,7 +304,7 @@ class _Maker:
         for one in node.names:
             if one.parts[0] not in types:
                 known = nearest(one.parts[0], [parameter.name for parameter in role.parameters])
-                self._refuse(one.position, f"{role.name} has no value {shown(one.parts[0])}{known}")
+                self._refuse(one.position, f"{role.name} has no value {quote(one.parts[0])}{known}")
         if self.findings:
             return None
         bound = {one.variable or "": one for one in row.pattern}
@@ -328,15 +328,15 @@ class _Maker:
         self._check_condition(node, chosen, {parameter.name for parameter in parameters})
         if self.findings:
             return None
-        trigger = tree.MessageTrigger(at, node.topic, chosen.type, at, None, _moved(pattern, at), node.when)
-        action = replace(node.action, statements=(*_moved(tuple(first), at), *node.action.statements))
-        return tree.EventDefinition(at, node.modifiers, node.name, _moved(parameters, at), trigger, action)
+        trigger = tree.MessageTrigger(at, node.topic, chosen.type, at, None, _move(pattern, at), node.when)
+        action = replace(node.action, statements=(*_move(tuple(first), at), *node.action.statements))
+        return tree.EventDefinition(at, node.modifiers, node.name, _move(parameters, at), trigger, action)
 
     def _check_condition(self, node: tree.TypedEvent, chosen: _Chosen, fields: Collection[str]) -> None:
         names = {name.parts[0] for name in node.names} - {*fields}
         for part in tree.walk(node.when):
             if isinstance(part, tree.Name) and part.parts[0] in names:
-                text = f"{shown(part.parts[0])} is not a field of {chosen.type}: test it in the action, not in `when`"
+                text = f"{quote(part.parts[0])} is not a field of {chosen.type}: test it in the action, not in `when`"
                 self._refuse(part.position, text)
 
 
@@ -378,7 +378,7 @@ def _cancelling(known: tree.Specification, topic: str, name: str) -> tree.Specif
 
 
 def _stopping(node: _T, instead: tree.Statement) -> _T:
-    return _changed(
+    return _change(
         node,
         lambda part: (
             replace(instead, position=part.position) if isinstance(part, tree.StopStatement) else None
@@ -394,20 +394,20 @@ def _with_values_of_roles(known: tree.Specification, topics: Iterable[_Chosen]) 
             types[chosen.role.name, parameter.name] = _of_variable(parameter.type)
     if not types:
         return known
-    return _changed(known, lambda part: types.get(part.name) if isinstance(part, tree.TypeName) else None)
+    return _change(known, lambda part: types.get(part.name) if isinstance(part, tree.TypeName) else None)
 
 
-def _moved(node: _T, at: Position) -> _T:
+def _move(node: _T, at: Position) -> _T:
     """Return a part of a role with the position of the event that it is used in."""
-    return _changed(node, lambda _part: None, at)
+    return _change(node, lambda _part: None, at)
 
 
-def _changed(
+def _change(
     node: _T, change: Callable[[tree.SyntaxNode], tree.SyntaxNode | None], at: Position | None = None
 ) -> _T:
     """Return a tree with changed nodes, and if `at` is given, with this position everywhere."""
     if isinstance(node, tuple):
-        return cast("_T", tuple(_changed(part, change, at) for part in node))
+        return cast("_T", tuple(_change(part, change, at) for part in node))
     if isinstance(node, Position):
         return cast("_T", at or node)
     if not isinstance(node, tree.SyntaxNode):
@@ -416,5 +416,5 @@ def _changed(
     if new is None:
         names = (each.name for each in fields(node))
         parts = zip(names, tree.fields_of(node), strict=True)
-        new = replace(node, **{name: _changed(part, change, at) for name, part in parts})
+        new = replace(node, **{name: _change(part, change, at) for name, part in parts})
     return cast("_T", new)

@@ -32,7 +32,7 @@ from rosmop.batch.recording_list import RecordingName, recordings_of
 from rosmop.batch.runner import JobRunner, executor_for
 from rosmop.recordings.recording import RecordingError
 from rosmop.tool.command_context import CommandContext
-from rosmop.tool.terminal import refused
+from rosmop.tool.terminal import refusal
 
 # Show progress on standard error: a bar on a terminal, lines if the user wants them, nothing otherwise.
 
@@ -155,7 +155,7 @@ def require(program: CommandContext, failures: Sequence[Failure], recordings: in
         return
     findings = [failure.findings for failure in failures]
     if findings[0] and all(other == findings[0] for other in findings):
-        raise refused(findings[0])
+        raise refusal(findings[0])
     if len(failures) == 1:
         raise program.usage_error(failures[0].text)
 

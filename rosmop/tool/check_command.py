@@ -4,7 +4,7 @@ from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
-from rosmop.fast.build import certified, require_loadable
+from rosmop.fast.build import certify, require_loadable
 from rosmop.fast.slow_paths import slow_paths
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -12,7 +12,7 @@ from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.picture import dot_of, svg_of
 from rosmop.run.engine import MonitorSet
 from rosmop.tool.command_context import CommandContext
-from rosmop.tool.monitor_output import explained, say_finding
+from rosmop.tool.monitor_output import explain, say_finding
 from rosmop.tool.specification_input import load
 from rosmop.tool.terminal import say, say_json
 from roswire.counted import counted
@@ -34,7 +34,7 @@ def check(
             raise program.usage_error(f"--prove needs the package {package}: pip install {package}")
     try:
         monitors = MonitorSet.of(load(program, files, folders))
-        certificates, data = certified(monitors.compiled)
+        certificates, data = certify(monitors.compiled)
         if find_spec("wasmtime") is not None:
             require_loadable(data)
         findings = [*monitors.warnings]
@@ -47,7 +47,7 @@ def check(
     if not as_json:
         _summarise(findings, errors, monitors)
         for monitor in monitors.monitors if monitors is not None else ():
-            for line in explained(monitor):
+            for line in explain(monitor):
                 say(f"{monitor.name}: {line}")
             for line, running in zip(certificates[monitor.name], monitor.properties, strict=True):
                 say(f"{monitor.name}: {line}")

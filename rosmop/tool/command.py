@@ -30,7 +30,7 @@ from rosmop.tool.options import (
     Workers,
 )
 from rosmop.tool.summaries import SUMMARIES
-from rosmop.tool.terminal import flowed
+from rosmop.tool.terminal import reflow
 
 _Command = Callable[..., None]
 _EXAMPLES = {
@@ -49,7 +49,7 @@ def commands_of(program: CommandContext) -> dict[str, _Command]:
         "coverage": _coverage_of(program),
     }
     for name, command in commands.items():
-        more = [flowed(command.__doc__)] if command.__doc__ else []
+        more = [reflow(command.__doc__)] if command.__doc__ else []
         command.__doc__ = "\n\n".join([*more, f"Example: {program.name} {name} {_EXAMPLES[name]}"])
     return commands
 

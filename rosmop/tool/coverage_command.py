@@ -9,12 +9,12 @@ from rich.table import Column
 from rosmop.batch.jobs import Coverage, CoverageJob, Failure
 from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
-from rosmop.learn.exercised import CoverageItem, items_of, merged
+from rosmop.learn.exercised import CoverageItem, add_counts, items_of
 from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.specification_input import read_for_recordings
 from rosmop.tool.tables import add_row, table_of
-from rosmop.tool.terminal import refused, say, say_json
+from rosmop.tool.terminal import refusal, say, say_json
 
 _KINDS = ("event", "branch", "function", "handler", "state", "transition")
 
@@ -32,9 +32,9 @@ def coverage(
         specifications = read_for_recordings(program, files, folders)
         items = items_of(specifications.texts)
     except SpecificationError as error:
-        raise refused(error.findings) from None
+        raise refusal(error.findings) from None
     with batch_session(program, options) as session:
-        counts, rows = _covered(session, specifications, items)
+        counts, rows = _cover(session, specifications, items)
         failed = any("error" in row for row in rows)
         rows += [
             {
@@ -57,7 +57,7 @@ def coverage(
     return SOME_FAILED if failed else 0
 
 
-def _covered(
+def _cover(
     session: BatchSession, specifications: Specifications, items: list[CoverageItem]
 ) -> tuple[dict[CoverageItem, int], list[dict[str, object]]]:
     jobs = [CoverageJob(recording, specifications) for recording in session.recordings]
@@ -65,7 +65,7 @@ def _covered(
     failures: dict[int, Failure] = {}
     for number, result in session.results("reading", jobs):
         if isinstance(result, Coverage):
-            counts = merged(counts, result.counts)
+            counts = add_counts(counts, result.counts)
             for note in result.notes:
                 session.program.warn(f"{note}; its messages are left out")
         elif isinstance(result, Failure):

@@ -50,7 +50,7 @@ def learn_monitors(
         try:
             learnt = learn(
                 [survey for _number, survey in surveys],
-                standard_definitions().extended(recorded),
+                standard_definitions().merge(recorded),
                 hold_out,
                 _Passes(session, [session.recordings[number] for number, _survey in surveys], recorded).run,
             )

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from rosmop.batch.replay_job import because, place_of
 from rosmop.form.findings import Diagnostic
 from rosmop.run.monitor import MonitorInstance
-from rosmop.run.outcomes import Fault, Outcome, bound, why_of
+from rosmop.run.outcomes import Fault, Outcome, binding, why_of
 from rosmop.tool.terminal import say, say_json
 
 BILLION = 1_000_000_000
@@ -49,7 +49,7 @@ def record(
     }
 
 
-def explained(monitor: MonitorInstance) -> Iterator[str]:
+def explain(monitor: MonitorInstance) -> Iterator[str]:
     slices, slicing = monitor.slices, monitor.code.slicing
     if slices is None or slicing is None:
         return
@@ -75,7 +75,7 @@ def lines(
         yield f"{head}: {outcome.result}" + (f" ({outcome.reason})" if outcome.reason else "")
     for verdict in outcome.verdicts:
         name = f"{verdict.monitor} ({verdict.logic} property {verdict.property})"
-        yield f"{head}: {verdict.category} of {name}{bound(verdict)}"
+        yield f"{head}: {verdict.category} of {name}{binding(verdict)}"
         yield from (f"{head}:   {line}" for line in because(verdict))
     for message in outcome.published:
         yield f"{head}: {'called' if message.is_call else 'published'} {message.topic} {message.type}"

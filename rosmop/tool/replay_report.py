@@ -34,7 +34,7 @@ class ReplayReport:
         self._closest: dict[tuple[Position, int, bool], tuple[ClosestMargin, str]] = {}
 
     def add(self, recording: str, result: Replayed | Failure) -> list[dict[str, object]]:
-        rows = self._printed(_rows(recording, result))
+        rows = self._print(_rows(recording, result))
         self._recordings.append(_Line.of(recording, result))
         if isinstance(result, Failure):
             self.failures.append(result)
@@ -54,7 +54,7 @@ class ReplayReport:
 
     def show(self, texts: Mapping[str, str]) -> list[dict[str, object]]:
         closest = [row for _key, row in sorted(self._closest.items())]
-        rows = self._printed(_margin_row(margin, recording) for margin, recording in closest)
+        rows = self._print(_margin_row(margin, recording) for margin, recording in closest)
         if self._as_json:
             return rows
         self._show_counts()
@@ -65,7 +65,7 @@ class ReplayReport:
         say(f"{counted(self.messages, 'message')} of {counted(len(self._recordings), 'recording')}")
         return rows
 
-    def _printed(self, rows: Iterable[dict[str, object]]) -> list[dict[str, object]]:
+    def _print(self, rows: Iterable[dict[str, object]]) -> list[dict[str, object]]:
         printed = list(rows)
         for row in printed if self._as_json else ():
             say_json(row)

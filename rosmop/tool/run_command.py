@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rosmop.batch.jobs import Failure, failure_of
 from rosmop.batch.recording_list import RecordingName
-from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replayed
+from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replay_recording
 from rosmop.form.findings import SpecificationError
 from rosmop.recordings.recording import Reader, RecordingError, definitions_of, open_recording
 from rosmop.recordings.replay import EVER, OutputBag, refusals, replay
@@ -23,7 +23,7 @@ from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
 from rosmop.tool.replay_report import MAX_IN_ROWS, ReplayReport
 from rosmop.tool.specification_input import read_for_recordings
-from rosmop.tool.terminal import refused, say, say_json
+from rosmop.tool.terminal import refusal, say, say_json
 from roswire.counted import counted
 
 _PROGRESS_EVERY = 1000
@@ -45,7 +45,7 @@ def run(
                 _run_single(program, specifications, options, options.single, output, as_json=as_json)
             return 0
     except SpecificationError as error:
-        raise refused(error.findings) from None
+        raise refusal(error.findings) from None
     if output is not None:
         raise program.usage_error("--output is for a single --bag FILE")
     with batch_session(program, options) as session:
@@ -90,7 +90,7 @@ def run_spans(
         recording = RecordingName(name, path.stat().st_size, "")
         job = ReplayJob(recording, specifications, topics, span, MAX_IN_ROWS, margins, strict=True, own=own)
         try:
-            report.add(name, replayed(job, path))
+            report.add(name, replay_recording(job, path))
         except (SpecificationError, RecordingError) as error:
             report.add(name, failure_of(error))
     require(program, report.failures, len(spans))

@@ -32,7 +32,7 @@ def load(
     """Compile the files. `recorded` applies to types that no file defines. Raises `SpecificationError`."""
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
-        definitions = recorded.extended(definitions)
+        definitions = recorded.merge(definitions)
     return compiled_from(read_specifications(program, files), definitions)
 
 
@@ -77,7 +77,7 @@ def read_definitions(program: CommandContext, files: Sequence[Path], folders: Se
     for folder in definition_folders(program, files, folders):
         texts, places = definition_texts(program, folder)
         try:
-            definitions = definitions.extended(Definitions.from_files(texts))
+            definitions = definitions.merge(Definitions.from_files(texts))
         except DefinitionError as error:
             place = places.get(error.source, str(folder / error.source))
             raise SpecificationError.at(Position(place, max(error.line, 1), 1), error.text) from None

@@ -19,7 +19,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
-def refused(findings: Iterable[object]) -> typer.Exit:
+def refusal(findings: Iterable[object]) -> typer.Exit:
     """Print the findings. The caller raises the result (exit status 1)."""
     for finding in findings:
         typer.echo(printable(str(finding)), err=True)
@@ -40,7 +40,7 @@ def say_json(fields: object) -> None:
     sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")
 
 
-def flowed(text: str) -> str:
+def reflow(text: str) -> str:
     """Return help with each paragraph on one line, which a terminal of any width then breaks; `\\b` keeps its lines."""
     paragraphs = inspect.cleandoc(text).split("\n\n")
     return "\n\n".join(one if one.startswith("\b\n") else " ".join(one.split()) for one in paragraphs)

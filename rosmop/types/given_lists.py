@@ -130,7 +130,7 @@ _READERS: Mapping[str, Callable[[str], object]] = {
 }
 
 
-def normalised(kind: str, value: str) -> str:
+def normalise(kind: str, value: str) -> str:
     """Return the value in one form. Raises `ValueError` if it is not one of the kind."""
     _READERS[kind](value)
     if kind == "hosts":

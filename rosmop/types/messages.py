@@ -65,7 +65,7 @@ class MessageTypes:
             if name in self.definitions.message_types:
                 raise UnknownNameError(f"the definition of {name} cannot be used: {error}") from None
             raise UnknownNameError(
-                f"unknown message type {shown(name)}{nearest(name, self.definitions.message_types)}; "
+                f"unknown message type {quote(name)}{nearest(name, self.definitions.message_types)}; "
                 "ROS's own are known, others need a .msg file (--msg DIR, or msg/ beside the file)"
             ) from None
 
@@ -83,14 +83,14 @@ class MessageTypes:
         if field not in slots:
             paths = self._paths_to(name, field)
             if paths:
-                raise UnknownNameError(f"{name} has no field {shown(field)}; did you mean `{paths[0]}`?")
-            raise UnknownNameError(f"{name} has no field {shown(field)}{nearest(field, slots)}")
+                raise UnknownNameError(f"{name} has no field {quote(field)}; did you mean `{paths[0]}`?")
+            raise UnknownNameError(f"{name} has no field {quote(field)}{nearest(field, slots)}")
         return slots[field]
 
     def constant(self, name: str, constant: str) -> Constant:
         constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
-            raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")
+            raise UnknownNameError(f"{name} has no constant {quote(constant)}{nearest(constant, constants)}")
         return constants[constant]
 
     def _paths_to(self, name: str, field: str) -> list[str]:
@@ -125,5 +125,5 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return ""
 
 
-def shown(name: str) -> str:
+def quote(name: str) -> str:
     return f"`{name if len(name) <= 60 else name[:57] + '…'}`"

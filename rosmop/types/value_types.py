@@ -163,14 +163,14 @@ def is_scalar(kind: Type) -> bool:
     return not isinstance(kind, VectorType | RecordType)
 
 
-def promoted(kind: Type) -> Type:
+def promote(kind: Type) -> Type:
     if isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits < 32):
         return INT
     return kind
 
 
 def common(left: Type, right: Type) -> Type:
-    left, right = promoted(left), promoted(right)
+    left, right = promote(left), promote(right)
     if isinstance(left, FloatingType) or isinstance(right, FloatingType):
         wide = [kind.bits for kind in (left, right) if isinstance(kind, FloatingType)]
         return FloatingType(max(wide))

@@ -31,14 +31,14 @@ class ServiceType:
     response: str
 
     @classmethod
-    def defined(cls, definitions: Definitions, name: str) -> "ServiceType":
+    def of(cls, definitions: Definitions, name: str) -> "ServiceType":
         service = definitions.service(name)
         return cls(name, definitions.service_md5sum(name), service.request.name, service.response.name)
 
 
 async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str, str]:
     fields = {"callerid": link.name, "service": service, "md5sum": ANY, "probe": "1"}
-    header, _reply = await _connected(
+    header, _reply = await _exchange(
         link, service, uri, fields, request=b"", seconds=link.limits.call_seconds
     )
     return header
@@ -48,13 +48,13 @@ async def call_service(
     link: NodeLink, service: str, uri: NodeUri, *, md5sum: str, request: bytes, seconds: float
 ) -> bytes:
     fields = {"callerid": link.name, "service": service, "md5sum": md5sum, "persistent": "0"}
-    _header, reply = await _connected(
+    _header, reply = await _exchange(
         link, service, uri, fields, request=encode_frame(request), seconds=seconds
     )
     return reply
 
 
-async def _connected(
+async def _exchange(
     link: NodeLink, service: str, uri: NodeUri, fields: Mapping[str, str], *, request: bytes, seconds: float
 ) -> tuple[dict[str, str], bytes]:
     """Return the header and the reply of a service. Without a request, wait for no reply."""

@@ -41,7 +41,7 @@ class MessageType:
     definition: str
 
     @classmethod
-    def defined(cls, definitions: Definitions, name: str) -> "MessageType":
+    def of(cls, definitions: Definitions, name: str) -> "MessageType":
         return cls(name, definitions.md5sum(name), definitions.full_text(name))
 
 
@@ -53,7 +53,7 @@ async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
     try:
         return await reader.readexactly(await _read_size(reader, limit))
     except asyncio.IncompleteReadError:
-        raise _ended() from None
+        raise _end_error() from None
 
 
 @contextlib.asynccontextmanager
@@ -73,7 +73,7 @@ async def held_frame(reader: asyncio.StreamReader, limit: int, memory: NodeMemor
         finally:
             memory.add(-held)
     except asyncio.IncompleteReadError:
-        raise _ended() from None
+        raise _end_error() from None
 
 
 async def _read_size(reader: asyncio.StreamReader, limit: int) -> int:
@@ -83,7 +83,7 @@ async def _read_size(reader: asyncio.StreamReader, limit: int) -> int:
     return int(size)
 
 
-def _ended() -> ConnectionResetError:
+def _end_error() -> ConnectionResetError:
     return ConnectionResetError("the peer ended the connection")
 
 
@@ -98,10 +98,10 @@ async def exchange_headers(
 ) -> dict[str, str]:
     """Send a header and return the answer. Raise `ProtocolError` with the peer's reason, or `OSError`."""
     writer.write(encode_header(header))
-    return accepted(await read_header(reader, seconds))
+    return require_accepted(await read_header(reader, seconds))
 
 
-def accepted(answer: dict[str, str]) -> dict[str, str]:
+def require_accepted(answer: dict[str, str]) -> dict[str, str]:
     """Return a peer's answer, or raise `ProtocolError` with its reason if it rejects the connection."""
     if "error" in answer:
         raise ProtocolError(f"the peer rejected the connection: {answer['error'][:1000]}")

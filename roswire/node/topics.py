@@ -18,8 +18,8 @@ from roswire.node.tcpros_streams import (
     ANY,
     MessageType,
     NodeLimits,
-    accepted,
     refuse,
+    require_accepted,
 )
 from roswire.node.xmlrpc_http import CALL_LIMITS, call_xmlrpc
 from roswire.tcpros import HEADER_LIMIT, Body, decode_header, encode_frame, encode_header
@@ -164,7 +164,7 @@ class NodeSubscription:
             }
             receiver.write(encode_header(fields))
             async with asyncio.timeout(limits.header_seconds):
-                header = accepted(decode_header(bytes(await receiver.next(HEADER_LIMIT))))
+                header = require_accepted(decode_header(bytes(await receiver.next(HEADER_LIMIT))))
             self._check(uri, header)
             yield receiver, header
         finally:

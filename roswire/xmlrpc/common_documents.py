@@ -39,7 +39,7 @@ _ARRAY, _END = b"<value><array><data>" + _SPACE, b"</data></array></value>" + _S
 _DECLARED = rb"<\?xml version=(?:'1\.0'|\"1\.0\")\?>"
 
 
-def _spaced(*parts: bytes) -> re.Pattern[bytes]:
+def _spaced_pattern(*parts: bytes) -> re.Pattern[bytes]:
     return re.compile(_SPACE.join([*parts, b""]))
 
 
@@ -49,11 +49,11 @@ def _list_in(group: bytes) -> bytes:
 
 
 _LIST = _list_in(b"(")
-_CALL = _spaced(
+_CALL = _spaced_pattern(
     _DECLARED, b"<methodCall>", rb"<methodName>([A-Za-z.]++)</methodName>", b"<params>",
     b"((?:<param>" + _SPACE + _ONE + _SPACE + b"</param>" + _SPACE + b")*)</params>", b"</methodCall>", rb"\Z",
 )  # fmt: skip
-_CALLS = _spaced(
+_CALLS = _spaced_pattern(
     _DECLARED,
     b"<methodCall>",
     rb"<methodName>system\.multicall</methodName>",
@@ -64,16 +64,16 @@ _CALLS = _spaced(
 _NAME = _SPACE.join(
     [b"<member>", b"<name>methodName</name>", b"<value><string>([A-Za-z]++)</string></value>"]
 )
-_CALL_IN = _spaced(
+_CALL_IN = _spaced_pattern(
     b"<value><struct>", _NAME, b"</member>", b"<member>", b"<name>params</name>", _LIST, b"</member>",
     b"</struct></value>",
 )  # fmt: skip
-_CALLS_END = _spaced(_END, b"</param>", b"</params>", b"</methodCall>", rb"\Z")
+_CALLS_END = _spaced_pattern(_END, b"</param>", b"</params>", b"</methodCall>", rb"\Z")
 _ANSWER_HEAD = _DECLARED, b"<methodResponse>", b"<params>", b"<param>"
 _ANSWER_END = b"</param>", b"</params>", b"</methodResponse>", rb"\Z"
-_ANSWER = _spaced(*_ANSWER_HEAD, _LIST, *_ANSWER_END)
-_ANSWERS, _ANSWERS_END = _spaced(*_ANSWER_HEAD, _ARRAY), _spaced(_END, *_ANSWER_END)
-_ANSWER_IN = _spaced(_ARRAY + _LIST + _END)
+_ANSWER = _spaced_pattern(*_ANSWER_HEAD, _LIST, *_ANSWER_END)
+_ANSWERS, _ANSWERS_END = _spaced_pattern(*_ANSWER_HEAD, _ARRAY), _spaced_pattern(_END, *_ANSWER_END)
+_ANSWER_IN = _spaced_pattern(_ARRAY + _LIST + _END)
 _VALUE = re.compile(_scalar(b"("))
 _STRUCT, _STRUCT_TAG = b"<value><struct>", re.compile(b"</?struct>")
 _ALONE = b"<methodResponse><params><param>%b</param></params></methodResponse>"

@@ -65,7 +65,7 @@ def test_topics_in_both_directions(site: Site, ros: RosSession, client: Client) 
             body, definition = await asyncio.wait_for(heard.get(), SECONDS)
             assert body.startswith(string("hello 1")[:4]) and b"hello " in body
             assert "string data" in definition
-            string_type = MessageType.defined(standard_definitions(), "std_msgs/String")
+            string_type = MessageType.of(standard_definitions(), "std_msgs/String")
             publisher = await door.advertise("/answer", string_type, latched=True, queue=10)
             publisher.publish(string("good morning"))
             listener = await asyncio.to_thread(ros.listener, client, "/answer")
@@ -84,7 +84,7 @@ def test_services_in_both_directions(site: Site, ros: RosSession, client: Client
             header = await door.probe_service("/theirs")
             assert header["type"] == "std_srvs/SetBool"
             assert (await door.call_service("/theirs", header["md5sum"], b"\x01", SECONDS))[:1] == b"\x00"
-            kind = ServiceType.defined(standard_definitions(), "std_srvs/SetBool")
+            kind = ServiceType.of(standard_definitions(), "std_srvs/SetBool")
 
             async def answer(request: bytes) -> bytes:
                 if request == b"\x00":

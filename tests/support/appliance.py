@@ -144,7 +144,7 @@ class Appliance:
             raise NoAnswerError(str(error)) from None
         if not answer.ok:
             raise NoAnswerError(answer.error)
-        return answer.given()
+        return answer.unwrap()
 
     def status(self) -> dict[str, Any]:
         return self.row("status")

@@ -11,7 +11,7 @@ from typing import Any
 from unittest import mock
 
 from appliance.cli import main
-from appliance.cli.lazy import loaded
+from appliance.cli.lazy import load_command
 from appliance.cli.verb_table import Group, Verb, Verbs
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
@@ -51,4 +51,4 @@ def table(verbs: Verbs | None = None) -> Iterator[tuple[str, Verb]]:
 
 @cache
 def commands() -> tuple[tuple[str, Any], ...]:
-    return tuple((name, loaded(verb, name.split()[-1])) for name, verb in table())
+    return tuple((name, load_command(verb, name.split()[-1])) for name, verb in table())

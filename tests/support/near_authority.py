@@ -16,7 +16,7 @@ class NearAuthority(Authority):
         self.lists = 0
         self.trouble = ""
 
-    async def stated(self) -> AuthorityStated:
+    async def statement(self) -> AuthorityStated:
         return AuthorityStated(0, self._near.certificate, self.trouble)
 
     async def issue(

@@ -21,7 +21,7 @@ def own_namespace() -> Iterator[None]:
 @contextlib.contextmanager
 def own_loopback() -> Iterator[None]:
     namespace = Namespace(f"rosrv-test-loopback.{os.getpid()}").create()
-    with namespace.entered():
+    with namespace.inside():
         interfaces.set_link(Namespace.own(), "lo", up=True)
         namespace.delete()  # only the name: it ends with the last process in it
         yield

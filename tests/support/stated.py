@@ -31,7 +31,7 @@ def stated(
 ) -> SpecificationsStated:
     if not files:
         return SpecificationsStated(revision, b"", {}, restarted, **more)
-    known = _standard().extended(Definitions.from_files(definitions))
+    known = _standard().merge(Definitions.from_files(definitions))
     try:
         monitors = MonitorSet.of(compiled_from(dict(files), known))
     except SpecificationError:

@@ -89,7 +89,7 @@ class Capture:
         self.frames: list[Frame] = []
         self._changed = threading.Condition()
         self._ended = False
-        with namespace.entered():
+        with namespace.inside():
             self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERYTHING))
         self._socket.setsockopt(
             socket.SOL_SOCKET, _RCVBUFFORCE, 32 << 20

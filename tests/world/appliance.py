@@ -202,7 +202,7 @@ class Appliance:
         mine, its = LinkEnd.pair(self.supervisor, self.lease)
         self._lease_lifeline = mine
         mine.process.run(mine.attach, None, self._heard_lease, lambda: None)
-        made = self.lease.run(LeaseProcess.opened, self.membership, its, self.state / EPOCH)
+        made = self.lease.run(LeaseProcess.open, self.membership, its, self.state / EPOCH)
         self.lease.start(made.run()).add_done_callback(self.world.done)
 
     def _heard_lease(self, message: Any, _descriptors: tuple[Any, ...]) -> None:

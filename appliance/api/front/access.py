@@ -174,7 +174,7 @@ class TokenAuthenticator:
         """Raise `ProblemError` (429) if a peer sent too many wrong secrets."""
         _require_patience(self._unknown, host)
 
-    def noted(self, host: str, *, valid: bool) -> None:
+    def note_attempt(self, host: str, *, valid: bool) -> None:
         if valid:
             self._remember(peer_key(host))
         else:

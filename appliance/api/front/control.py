@@ -54,7 +54,7 @@ class ControlAwayError(Exception):
         self.active = active
 
 
-def _made(
+def _make_request(
     number: int, request: AdminRequest[object], bearer: Bearer | None, until: float = math.inf
 ) -> RequestMade:
     shown = bearer.shown if bearer is not None else ""
@@ -121,7 +121,7 @@ class ControlLink:
         changes = type(request) in ORDERS
         longest = seconds + _GRACE_SECONDS if changes else seconds
         try:
-            answer = await self._asked(request, bearer, clock.now() + seconds, longest)
+            answer = await self._ask(request, bearer, clock.now() + seconds, longest)
         except TimeoutError:
             raise ControlAwayError(
                 f"the appliance did not answer within {longest:g} s{_UNKNOWN if changes else ''}"
@@ -134,7 +134,7 @@ class ControlLink:
             ) from None
         return decode(answer, request)
 
-    async def _asked(
+    async def _ask(
         self, request: AdminRequest[object], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
         number = 0
@@ -142,7 +142,7 @@ class ControlLink:
         def question(given: int) -> RequestMade:
             nonlocal number
             number = given
-            return _made(number, request, bearer, until)
+            return _make_request(number, request, bearer, until)
 
         def withdraw(gone: "asyncio.Future[None]") -> None:
             if not gone.cancelled():

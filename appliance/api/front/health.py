@@ -9,7 +9,7 @@ from appliance.api.front.history import SampleHistory
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.routing import Responses, Routes
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.status_summary import unserved
+from appliance.channel.status_summary import why_unserved
 
 _PATIENCE_SECONDS = 1.0
 
@@ -36,9 +36,9 @@ def routes(control: ControlLink, history: SampleHistory) -> Routes:
         if not control.connected:
             raise ProblemError(503, "not-available", "RVMaster is being restarted", retry_after=1)
         seen = history.seen
-        if seen.status is None or unserved(seen.status) is not None:
+        if seen.status is None or why_unserved(seen.status) is not None:
             seen = await history.again(_PATIENCE_SECONDS)
-        if seen.status is None or unserved(seen.status) is not None:
+        if seen.status is None or why_unserved(seen.status) is not None:
             raise ProblemError(
                 503, "not-served", "nodes are not served: GET /v1/status says why", retry_after=1
             )

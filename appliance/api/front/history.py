@@ -127,7 +127,7 @@ async def measures_of(control: ControlLink) -> Measures:
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error, answer.active)
-    return answer.given()
+    return answer.unwrap()
 
 
 def sample_of(body: Measures, now: float) -> Sample:

@@ -186,7 +186,7 @@ class Listener:
         self._config.load()
         self._state = ServerState()
         self.limits = HttpLimits(head_seconds=limits.header_seconds, idle_seconds=_KEEP_ALIVE_SECONDS)
-        bounds = REST_CONNECTIONS.bounds.sized(
+        bounds = REST_CONNECTIONS.bounds.resize(
             connections_within(limits.connections), limits.connections_per_host
         )
         self.connection_table: ConnectionTable[str] = ConnectionTable(

@@ -48,7 +48,7 @@ def describe(schema: dict[str, Any]) -> None:
         schema["properties"] = fields
 
 
-def given(text: str) -> int:
+def parse_moment(text: str) -> int:
     """Return nanoseconds since the epoch. Raises `ProblemError` (422)."""
     try:
         return parse_timestamp(text, clock.wall_ns())

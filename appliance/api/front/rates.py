@@ -18,7 +18,7 @@ class Buckets:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, host: str, now: float) -> float:
-        left = self._left(host, now)
+        left = self._tokens_left(host, now)
         if left < 1:
             self._keep(host, left, now)
             return (1 - left) / self._per_second
@@ -26,17 +26,17 @@ class Buckets:
         return 0.0
 
     def give_back(self, host: str, now: float) -> None:
-        self._keep(host, min(self._burst, self._left(host, now) + 1), now)
+        self._keep(host, min(self._burst, self._tokens_left(host, now) + 1), now)
 
     def wait(self, host: str, now: float) -> float:
         """Return the seconds until `take` succeeds, without taking a token."""
-        left = self._left(host, now)
+        left = self._tokens_left(host, now)
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 
-    def touched(self, host: str, now: float) -> bool:
-        return self._left(host, now) < self._burst
+    def is_touched(self, host: str, now: float) -> bool:
+        return self._tokens_left(host, now) < self._burst
 
-    def _left(self, host: str, now: float) -> float:
+    def _tokens_left(self, host: str, now: float) -> float:
         left, then = self._buckets.get(peer_key(host), (self._burst, now))
         return min(self._burst, left + max(0.0, now - then) * self._per_second)
 

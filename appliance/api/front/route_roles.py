@@ -74,7 +74,7 @@ _PASSIVE_SECONDS = 2  # until a client may ask a standby again
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
     """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
-    return answered(await control.ask(request, bearer))
+    return unwrap(await control.ask(request, bearer))
 
 
 async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A | None:
@@ -85,10 +85,10 @@ async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: B
         return None
 
 
-def answered(answer: AdminAnswer[A]) -> A:
+def unwrap(answer: AdminAnswer[A]) -> A:
     """Return what control's answer contains. Raises `ProblemError` for a rejection."""
     if answer.ok:
-        return answer.given()
+        return answer.unwrap()
     if answer.trouble == "standby":
         raise only_passive(answer.error, answer.active)
     raise problem_of(answer.trouble, "\n".join([answer.error, *answer.findings]))

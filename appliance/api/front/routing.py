@@ -30,7 +30,7 @@ class Tagged(NamedTuple, Generic[A]):
     tag: int | str
 
 
-def tagged(body: A) -> Tagged[A]:
+def with_tag(body: A) -> Tagged[A]:
     return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # each versioned answer has a revision
 
 
@@ -227,8 +227,8 @@ def _operations_at(request: Request) -> dict[str, Any]:
 
 def _encode(endpoint: Callable[..., Awaitable[object]]) -> Callable[..., Awaitable[Response]]:
     @functools.wraps(endpoint)
-    async def answered(*arguments: object, **named: object) -> Response:
+    async def wrapper(*arguments: object, **named: object) -> Response:
         given = await endpoint(*arguments, **named)
         return answer(given.body, tag=given.tag) if isinstance(given, Tagged) else answer(given)
 
-    return answered
+    return wrapper

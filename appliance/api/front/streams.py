@@ -33,7 +33,7 @@ class Streams:
     def __init__(self, row: QuotaRow, whole: int) -> None:
         self.roles: dict[str, TokenRole] = {}
         host = max(1, row.bounds.host * whole // row.bounds.whole)
-        self._tokens: Pool[str] = Pool("of these", row.bounds.sized(whole, host), self._quota_class)
+        self._tokens: Pool[str] = Pool("of these", row.bounds.resize(whole, host), self._quota_class)
 
     def take(self, bearer: Bearer, what: str) -> Callable[[], None]:
         """Return the function that ends the long answer. Raises `ProblemError` (503)."""
@@ -65,7 +65,7 @@ class Work:
     def __init__(self, what: str, whole: int) -> None:
         self._what = what
         self._turns: Turns[tuple[str, TokenRole]] = Turns(
-            REST_WORK.bounds.sized(whole, max(1, whole // 2)), _class_of
+            REST_WORK.bounds.resize(whole, max(1, whole // 2)), _class_of
         )
 
     @contextlib.asynccontextmanager

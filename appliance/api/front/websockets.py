@@ -45,7 +45,7 @@ class ShownTickets:
         self._right: OrderedDict[bytes, float] = OrderedDict()
         self._wrong: OrderedDict[bytes, float] = OrderedDict()
 
-    def shown(self, target: bytes) -> str:
+    def digest_of(self, target: bytes) -> str:
         """Return a digest of the ticket in a URL if it was valid before, or an empty text."""
         with suppress(ProblemError):
             digest = self._digest(*_entry_of(target))
@@ -62,7 +62,7 @@ class ShownTickets:
 
     def answered(self, peer: str, name: str, ticket: str, *, valid: bool) -> None:
         shown = self._digest(name, ticket)
-        self._doorkeeper.noted(peer, valid=valid)
+        self._doorkeeper.note_attempt(peer, valid=valid)
         for kept in (self._right, self._wrong):
             kept.pop(shown, None)
         kept = self._right if valid else self._wrong
@@ -163,7 +163,7 @@ class WebSocketHandover:
         """Pass a WebSocket on, or answer with the reason of the refusal."""
         host = passage.peer
         try:
-            self._gate.admit_websocket(host, PREFIX.decode(), self._tickets.shown(passage.target))
+            self._gate.admit_websocket(host, PREFIX.decode(), self._tickets.digest_of(passage.target))
             name, ticket = _entry_of(passage.target)
             self._tickets.require(host, name, ticket)
             here, there = socket.socketpair()
@@ -185,7 +185,7 @@ class WebSocketHandover:
         except ControlAwayError as error:
             passage.refuse("503 Service Unavailable", str(error))
             return
-        passage.note = partial(self._doorkeeper.noted, host, valid=True)
+        passage.note = partial(self._doorkeeper.note_attempt, host, valid=True)
         passage.begin(_without_ticket(head, name))
 
 

@@ -37,11 +37,11 @@ EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
-        app.openapi_schema = _made(app)
+        app.openapi_schema = _make(app)
     return app.openapi_schema
 
 
-def _made(app: FastAPI) -> dict[str, Any]:
+def _make(app: FastAPI) -> dict[str, Any]:
     document = get_openapi(
         title=app.title,
         version=app.version,
@@ -69,9 +69,9 @@ def _made(app: FastAPI) -> dict[str, Any]:
     for path in document["paths"].values():
         for method, operation in path.items():
             _complete(operation)
-            _exemplified(operation)
+            _add_examples(operation)
             if method == "get":
-                _tagged(operation["responses"])
+                _add_tags(operation["responses"])
     return document
 
 
@@ -89,7 +89,7 @@ def _plain(schema: Any) -> Any:
     return {name: _plain(part) for name, part in schema.items() if not (name == "items" and part is False)}
 
 
-def _tagged(responses: dict[str, Any]) -> None:
+def _add_tags(responses: dict[str, Any]) -> None:
     good = responses["200"]
     if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
         good.setdefault("headers", {})["ETag"] = _HASH
@@ -99,7 +99,7 @@ def _tagged(responses: dict[str, Any]) -> None:
         }
 
 
-def _exemplified(operation: dict[str, Any]) -> None:
+def _add_examples(operation: dict[str, Any]) -> None:
     name = operation["operationId"]
     if name in EXAMPLES:
         (answer,) = operation["responses"]["200"]["content"].values()

@@ -51,7 +51,7 @@ class LogReader:
         async with self._searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
-    async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
+    async def resolve_names(self, bearer: Bearer, wanted: Filter) -> Filter:
         if not has_name(wanted):
             return wanted
         return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))

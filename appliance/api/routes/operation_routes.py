@@ -15,15 +15,15 @@ from appliance.api.front.etags import etag
 from appliance.api.front.problems import ProblemError, refusal
 from appliance.api.front.recording_id import CONVERTORS
 from appliance.api.front.request_gate import asked_of
-from appliance.api.front.route_roles import answered, problem_of, requires
-from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
+from appliance.api.front.route_roles import problem_of, requires, unwrap
+from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, with_tag
 from appliance.api.front.services import Services
 from appliance.channel.admin import MONITORS, A, AdminAnswer, AdminRequest, answer_to
 from appliance.channel.answers.token_answers import may
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_bodies import DATE, DATED, WHOLE
-from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
+from appliance.channel.rest_meaning import BadTagError, NoOrderError, order_of
 from appliance.channel.rest_operation import Body, Operation, extra_of, plain, rules_of
 
 _RULES = ("description", "examples", "gt", "ge", "lt", "le", "min_length", "max_length", "pattern")
@@ -81,7 +81,7 @@ class OperationCall(Generic[Q_co]):
             raise refusal(done.error, done.findings)
         if done.trouble == "conflict" and done.tag:  # the present ETag is in the answer
             raise ProblemError(412, "changed-meanwhile", done.error, headers={"ETag": etag(done.tag)})
-        return answered(done)
+        return unwrap(done)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
         done = await call.ask(call.order)
         if operation.status != 200:
             return answer(done, operation.status)
-        return tagged(done) if operation.of is not None else done
+        return with_tag(done) if operation.of is not None else done
 
     has_model = given is not Response
     options: dict[str, object] = {"response_model": given} if has_model else {"response_class": Response}
@@ -190,7 +190,7 @@ def _check(
 
 def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[object]:
     try:
-        return meant(asked, dry_run=dry_run)
+        return order_of(asked, dry_run=dry_run)
     except BadTagError as error:
         raise ProblemError(412, "changed-meanwhile", str(error)) from None
     except NoOrderError as error:

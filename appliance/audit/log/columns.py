@@ -55,7 +55,7 @@ def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
     """Return the columns of a record. This never fails, whatever the record contains."""
     with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError, RecursionError):
         columns = msgspec.convert(_columns(record, sequence), StoredColumns)
-        packed(columns)  # raises UnicodeEncodeError, a ValueError, for a lone surrogate
+        pack(columns)  # raises UnicodeEncodeError, a ValueError, for a lone surrogate
         if isinstance(record.detail, dict) and len(columns.detail) <= LARGEST_DETAIL:
             return columns
     return StoredColumns(*_columns(plain_record(record), sequence))
@@ -164,17 +164,17 @@ def _text(value: object) -> str:
     return value.encode("utf-8", "backslashreplace").decode()
 
 
-def packed(columns: tuple[object, ...]) -> bytes:
+def pack(columns: tuple[object, ...]) -> bytes:
     """Return the columns as an array, so that no two rows have the same encoding."""
     return _packer.encode(columns)
 
 
 def content_hash(columns: tuple[object, ...]) -> bytes:
-    return hashlib.sha256(packed(columns)).digest()
+    return hashlib.sha256(pack(columns)).digest()
 
 
 def follows(previous: bytes, columns: tuple[object, ...], digest: bytes) -> bool:
-    return log_proof.follows(previous, packed(columns), digest)
+    return log_proof.follows(previous, pack(columns), digest)
 
 
 def record_hash(previous: bytes, columns: tuple[object, ...]) -> bytes:

@@ -179,7 +179,7 @@ class AuditLog:
     """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
 
     `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. The owner passes the
-    answers of `signer` to `signed` or `refused`, those of `removals` to `removal_signed` or `removal_refused`.
+    answers of `signer` to `store_signature` or `refused`, those of `removals` to `removal_signed` or `removal_refused`.
     `held_by` gets the ids of processes that lock the log.
     """
 
@@ -285,7 +285,7 @@ class AuditLog:
         waiting = self._backlog
         return Lag(waiting, now() - self._caught_up if waiting else 0.0)
 
-    def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
+    def store_signature(self, number: int, signature: bytes, public_key: bytes) -> None:
         """Store a signature of the signer, if it is valid and made with the pinned key."""
         keep = self.housekeeping.keep_signature
         self._soon(lambda writer: keep(writer, number, signature, public_key))

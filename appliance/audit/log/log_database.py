@@ -85,7 +85,7 @@ def create(path: Path, begun: int) -> None:
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
     """Return a connection that commits durably. Raises `LogUnreadableError` and `sqlite3.Error`."""
-    connection = _connected(path, "rw", _FOR_WRITING)
+    connection = _connect(path, "rw", _FOR_WRITING)
     mode = connection.execute("PRAGMA journal_mode").fetchone()[0]
     if mode != "wal":
         connection.close()
@@ -114,7 +114,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
     mode = "ro"
     if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
         mode = "ro&immutable=1"  # a copy on a read-only medium does not change
-    return _connected(path, mode, ())
+    return _connect(path, mode, ())
 
 
 @contextmanager
@@ -127,7 +127,7 @@ def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[
         raise LogUnreadableError(f"{path}: cannot be read: {error}{advice}") from error
 
 
-def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connection:
+def _connect(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connection:
     """Return a connection with these settings to a database that is a log."""
     connection = sqlite3.connect(
         f"file:{quote(str(path.absolute()))}?mode={mode}",

@@ -150,7 +150,7 @@ class ChainWriter:
         self.checkpoint_number, self._sealed_through = number, self.sequence
         self._checkpoint_hash = checkpoint_hash(text)
 
-    def unsigned(self, after: int, limit: int) -> list[tuple[int, bytes]]:
+    def unsigned_checkpoints(self, after: int, limit: int) -> list[tuple[int, bytes]]:
         """Return the numbers and texts of unsigned checkpoints above the number `after`, oldest first."""
         query = "SELECT number, text FROM checkpoint WHERE signature IS NULL AND number > ? ORDER BY number LIMIT ?"
         return self._connection.execute(query, (after, limit)).fetchall()

@@ -119,7 +119,7 @@ def fields_of(entry: LogEntry) -> dict[str, str | None]:
     }
 
 
-def requested(record: AuditRecord) -> str | None:
+def request_of(record: AuditRecord) -> str | None:
     call = record.detail.get("call")
     if record.category != "command" and isinstance(call, str) and call.startswith(_GIVES_UP):
         return call

@@ -89,7 +89,7 @@ class Signatures:
         if again:
             self._asked.clear()
         left = ASKED_AT_ONCE - len(self._asked)
-        for number, text in writer.unsigned(max(self._asked, default=0), left):
+        for number, text in writer.unsigned_checkpoints(max(self._asked, default=0), left):
             oldest = not self._asked
             self._asked.add(number)
             self._signer(number, text, oldest=oldest)

@@ -100,10 +100,10 @@ class _HostCounts:
 def summary_of_log(path: Path, wanted: Filter, limit: int) -> DenialSummary:
     """Return the summary of a log, with at most `limit` hosts. Raises `LogUnreadableError` and `FilterError`."""
     denials = msgspec.structs.replace(wanted, decision=("deny",))
-    return summarised(export(path, denials, _PAGE, newest_first=True), limit)
+    return summarise(export(path, denials, _PAGE, newest_first=True), limit)
 
 
-def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
+def summarise(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
     hosts: dict[str, _HostCounts] = {}
     counted_since, last = None, 0
     for number, entry in enumerate(denials):

@@ -86,7 +86,7 @@ def times_of(event: str, detail: dict[str, object]) -> int:
     return 1 if event in _ABOUT_THE_LOG else repetitions(detail)
 
 
-def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
+def group_equal(entries: Iterable[LogEntry]) -> list[EqualRecords]:
     rows: list[EqualRecords] = []
     open_rows: list[tuple[EqualKey, EqualRecords]] = []
     for entry in entries:
@@ -106,7 +106,7 @@ def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
 
 
 def equality_of(record: AuditRecord) -> dict[str, object]:
-    """Return everything that a client needs to make the rows of `grouped` itself.
+    """Return everything that a client needs to make the rows of `group_equal` itself.
 
     Equal records have equal keys, and equal reasons unless one is empty. A record joins one of the last `reach`
     rows.

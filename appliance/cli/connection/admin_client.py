@@ -66,11 +66,11 @@ class AdminSocket:
             answer = AdminSocket(self.state, QUICK_SECONDS, 0.1).ask(StatusWanted())
         except NotRunningError:
             return ""
-        return answer.given().name if answer.ok else ""
+        return answer.unwrap().name if answer.ok else ""
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Return the appliance's answer. Raises `NotRunningError`."""
-        line = encoded(request)
+        line = encode_request(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
             raise self._absent("no such directory; give the appliance's state directory with --state")
@@ -131,7 +131,7 @@ class AdminSocket:
         return bytes(line)
 
 
-def encoded(request: AdminRequest[object]) -> bytes:
+def encode_request(request: AdminRequest[object]) -> bytes:
     """Return the request's bytes. Raises `NotRunningError` for text that is not valid UTF-8, and for huge numbers."""
     try:
         msgspec.msgpack.encode(request)  # JSON would also take numbers of more than 64 bits

@@ -134,7 +134,7 @@ class RestLog:
     def _lines(self, path: str, params: dict[str, object], seconds: float) -> Iterator[Iterator[str]]:
         with (
             self._refusals(),
-            self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,
+            self._client.stream("GET", _PATH + path, params=params, seconds=seconds) as answer,
         ):
             yield answer.iter_lines()
 

@@ -9,7 +9,7 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble, operation_of
 from appliance.channel.answers.graph_answers import Graph, Registration, Registrations
 from appliance.channel.rest_meaning import call_of
-from appliance.cli.connection.admin_client import NotRunningError, RestProblemError, encoded
+from appliance.cli.connection.admin_client import NotRunningError, RestProblemError, encode_request
 from appliance.cli.connection.rest_session import RestClient
 
 
@@ -21,7 +21,7 @@ class RestWay:
         self.client = RestClient(url, token, ca_file)
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        encoded(request)  # rejects text that the socket would also reject
+        encode_request(request)  # rejects text that the socket would also reject
         try:
             return AdminAnswer(True, _carry_out(self.client, request))
         except RestProblemError as problem:

@@ -79,7 +79,7 @@ class RestClient:
         An `order` is signed unless it is a GET; a dry run is not an order.
         """
         headers = {"If-Match": "*"} if match else {}
-        with self.streamed(
+        with self.stream(
             method, path, params=params, body=body, seconds=seconds, headers=headers, order=order
         ) as answer:
             text = answer.read()
@@ -94,7 +94,7 @@ class RestClient:
         return found
 
     @contextmanager
-    def streamed(
+    def stream(
         self,
         method: str,
         path: str,

@@ -48,7 +48,7 @@ def _named_by_socket(state: Path) -> HostInWords:
         answer = AdminSocket(state, QUICK_SECONDS, 0.1).ask(PolicyWanted())
     except NotRunningError:
         return str
-    return host_in_words(answer.given() if answer.ok else None)
+    return host_in_words(answer.unwrap() if answer.ok else None)
 
 
 def _named_by_rest(way: "RestWay") -> HostInWords:
@@ -143,7 +143,7 @@ class Appliance(typer.Context):
 
     def body_or_exit(self, answer: AdminAnswer[A]) -> A:
         if answer.ok:
-            return answer.given()
+            return answer.unwrap()
         if self.as_json:
             typer.echo(msgspec.json.encode({"error": answer.error, "findings": answer.findings}).decode())
         else:
@@ -156,7 +156,7 @@ class Appliance(typer.Context):
         """Return the body, for a verb that asks again. Raises `NotRunningError` for every rejection."""
         if not answer.ok:
             raise NotRunningError(answer.error)
-        return answer.given()
+        return answer.unwrap()
 
 
 class _ApplianceCommand(GroupedCommand):

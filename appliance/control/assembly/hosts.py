@@ -46,7 +46,7 @@ class SiteHosts:
 
     def names(self) -> dict[str, str]:
         """Return the addresses in the tunnels of enrolled hosts, by their names."""
-        rows = self.table.enrolled()
+        rows = self.table.hosts()
         return {row.name: row.address for row in rows if self.table.is_for_hosts(row.address)}
 
 

@@ -50,7 +50,7 @@ class Answering:
         self._numbers = itertools.count()
         self._answered = clock.now()
 
-    def watched(self, handler: Handler) -> Handler:
+    def watch(self, handler: Handler) -> Handler:
         async def handle(request: HttpRequest) -> bytes:
             number = next(self._numbers)
             self._begun[number] = clock.now()
@@ -85,7 +85,7 @@ class ListenerLimits:
         )
         self.connection_table = ConnectionTable(
             quota_class,
-            connections=RVMASTER_CONNECTIONS.bounds.sized(
+            connections=RVMASTER_CONNECTIONS.bounds.resize(
                 connections_within(limits.connections), limits.connections_per_host
             ),
             connection_class=partial(connection_class_of, policy, quota_class),
@@ -141,8 +141,8 @@ class ListenerLimits:
         # The rosout aggregator calls from this machine. The policy need not name this machine.
         if peer.here or policy.serves(peer.host):
             return None
-        denial = policy.blocked(peer.host)
-        reason = policy.unnamed(peer.host) if denial is None else denial.reason
+        denial = policy.block_of(peer.host)
+        reason = policy.why_unnamed(peer.host) if denial is None else denial.reason
         told = reason if denial is None else text_for_caller(denial, policy.tell)
         return partial(self._refuse_unknown, peer, reason, told)
 
@@ -267,7 +267,7 @@ class HostQuotaClass:
             return None
         policy = self._policy()
         if address.is_loopback or any(address in network for network in policy.robot):
-            return None if policy.blocked(address) is not None else THE_ROBOT
+            return None if policy.block_of(address) is not None else THE_ROBOT
         if policy.named <= {EVERYONE}:
             return DiskGroup(host) if self(address) is QuotaClass.REGISTERED else None
         return DiskGroup(policy.alike(address)) if policy.names(address) else None

@@ -7,7 +7,7 @@ from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import MonitorRow
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Kind, Registry
-from appliance.specifications.judgement import broken
+from appliance.specifications.judgement import broken_files
 from appliance.specifications.live_topics import LiveType, Published
 from appliance.specifications.specification_manager import SpecificationManager
 
@@ -48,7 +48,7 @@ def monitors_status(monitors: SpecificationManager) -> MonitorsState:
         confirm_by=monitors.confirm_by,
         shadow=[row.name for row in rows if row.shadow],
         why_held={row.name: row.why_held for row in rows if row.why_held},
-        left_out=broken(monitors.now),
+        left_out=broken_files(monitors.now),
         folder_refused=monitors.now.folder_refused if differs else "",
         unbuilt={name: monitors.checked.monitors[name] for name in monitors.checked.unbuilt},
         unconfirmed={row.name: row.confirm_by for row in rows if row.confirm_by is not None},
@@ -65,7 +65,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
     return answers.MonitorState(
         name=name,
         file=checked.monitors[name],
-        enabled=monitors.switches.enabled(name),
+        enabled=monitors.switches.is_enabled(name),
         held=name in monitors.rollout.held,
         failing=row.failing,
         topics=sorted(checked.topics[name]),

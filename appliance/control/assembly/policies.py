@@ -23,7 +23,7 @@ from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.control.assembly.policy_gate import (
     KeptPolicy,
-    judged,
+    accept,
     policy_at_start,
     read_policy,
     with_cases,
@@ -33,7 +33,7 @@ from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.host_sets import Network
 from appliance.policy.hours import changes_of
 from appliance.policy.judgement import PolicyContext
-from appliance.policy.live_rights import LiveRight, deprived, may_keep
+from appliance.policy.live_rights import LiveRight, lost_rights, may_keep
 from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
@@ -162,7 +162,7 @@ class Policies(Revisions[RevisionRow]):
     async def changing(self, expected: int | str | None) -> AsyncIterator[None]:
         async with super().changing(expected):
             yield
-            await self.store.settled()
+            await self.store.until_settled()
             await self._carried_out()
 
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
@@ -213,7 +213,7 @@ class Policies(Revisions[RevisionRow]):
 
     def hosts_changed(self) -> int:
         try:
-            policy = judged(self.current.text, self.in_force.signature, self.current.file, self.known)
+            policy = accept(self.current.text, self.in_force.signature, self.current.file, self.known)
         except PolicyRefusedError as error:  # a defect: the same text was valid before
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
@@ -239,8 +239,8 @@ class Policies(Revisions[RevisionRow]):
 
         Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
-        row = await self.wanted(revision)
-        policy = judged(row.text, row.signature, row.file, self.known)
+        row = await self.require(revision)
+        policy = accept(row.text, row.signature, row.file, self.known)
         note = f"rolled back to revision {row.revision}"
         settled = self.settles(row.revision)
         return self._keep(policy, row.signature, who=who, note=note, settled=settled)
@@ -255,7 +255,7 @@ class Policies(Revisions[RevisionRow]):
             return answers.PolicyConfirmed(waited, self.revision)
 
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
-        rows = [self.described(row) for row in await self.rows()]
+        rows = [self.describe(row) for row in await self.rows()]
         return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
@@ -264,12 +264,12 @@ class Policies(Revisions[RevisionRow]):
 
     async def one_revision(self, request: admin.PolicyRevisionWanted) -> answers.RevisionText:
         row = await self._kept_revision(request.revision)
-        return msgspec.convert(self.described(row), answers.RevisionText)
+        return msgspec.convert(self.describe(row), answers.RevisionText)
 
-    async def compiled(self, number: int) -> Policy | None:
+    async def compile_revision(self, number: int) -> Policy | None:
         try:
             row = await self._kept_revision(number)
-            return judged(row.text, row.signature, row.file, self.known)
+            return accept(row.text, row.signature, row.file, self.known)
         except (UnknownThingError, PolicyRefusedError):
             return None
 
@@ -281,7 +281,7 @@ class Policies(Revisions[RevisionRow]):
 
     def _text(self, row: RevisionRow, known: PolicyContext) -> answers.PolicyKnown:
         return answers.PolicyKnown(
-            **self.described(row),
+            **self.describe(row),
             policy_file=str(self.file),
             differs_from_file=self.differs_from_file,
             warnings=[str(warning) for warning in self.current.warnings],
@@ -352,7 +352,7 @@ class Policies(Revisions[RevisionRow]):
             if cases is None
             else replace(known, cases_file=cases.file, cases=cases.text)
         )
-        return judged(text, signature, file, tested), signature
+        return accept(text, signature, file, tested), signature
 
     def _keep(
         self,
@@ -435,7 +435,7 @@ class Policies(Revisions[RevisionRow]):
         for name, change in wanted.items():
             if name not in known:  # also a date that passed before the load has passed for good
                 self.ends.set(self.changes, name, max(0.0, change - now))
-            elif name in known - self._passed and self.ends.passed(self.changes, name):
+            elif name in known - self._passed and self.ends.is_over(self.changes, name):
                 self._passed.add(name)
                 self.ends.forget(self.changes, name)
                 self.ends.set(self.changes, name, 0.0)
@@ -451,7 +451,7 @@ class Policies(Revisions[RevisionRow]):
 def passed_changes(ends: EndTable) -> dict[float, bool]:
     """Return whether each of the expected changes of rights has passed; the keys are seconds since the epoch."""
     kind = Policies.changes
-    return {datetime.fromisoformat(name).timestamp(): ends.passed(kind, name) for name in ends.names(kind)}
+    return {datetime.fromisoformat(name).timestamp(): ends.is_over(kind, name) for name in ends.names(kind)}
 
 
 def _closed(policy: Policy) -> dict[str, str]:
@@ -465,7 +465,7 @@ def _losses(policy: Policy, before: Policy, live: Iterable[LiveRight]) -> list[s
     return [
         f"warning: {host} has nodes ({_some(nodes)}) and loses all its rights: if that is a mistake, "
         "`rosrv policy rollback` and name the host in the policy"
-        for host, nodes in deprived(policy, had).items()
+        for host, nodes in lost_rights(policy, had).items()
     ]
 
 

@@ -45,17 +45,17 @@ def policy_at_start(
     """Return `kept` if it comes first or the file fails, else the file's policy. Raises `PolicyRefusedError`."""
     if kept is not None and kept_first:
         try:
-            return StartingPolicy(judged(kept.text, kept.signature, kept.file, known), kept.signature)
+            return StartingPolicy(accept(kept.text, kept.signature, kept.file, known), kept.signature)
         except PolicyRefusedError as error:
             raise PolicyRefusedError([*error.findings, _KEPT.format(kept)]) from error
     try:
         text, signature = read_policy(file)
-        return StartingPolicy(judged(text, signature, str(file), with_cases(known, file)), signature)
+        return StartingPolicy(accept(text, signature, str(file), with_cases(known, file)), signature)
     except PolicyRefusedError as refused:
         if kept is None:
             raise
         try:
-            policy = judged(kept.text, kept.signature, kept.file, known)
+            policy = accept(kept.text, kept.signature, kept.file, known)
         except PolicyRefusedError as error:
             raise PolicyRefusedError(
                 [*refused.findings, _NOT_EITHER.format(kept, error.findings[0])]
@@ -70,9 +70,9 @@ def read_policy(file: Path) -> tuple[str, str]:
         raise PolicyRefusedError([f"{file}: the policy cannot be read: {_error_text(error)}"]) from error
 
 
-def judged(text: str, signature: str, file: str, known: PolicyContext) -> Policy:
+def accept(text: str, signature: str, file: str, known: PolicyContext) -> Policy:
     try:
-        return judge(text, file, known, signature).accepted()
+        return judge(text, file, known, signature).accept()
     except PolicyError as error:
         raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 

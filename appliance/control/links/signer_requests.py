@@ -70,7 +70,7 @@ class SignerRequests:
         match message:
             case messages.SignatureMade(number, signature, public_key, others):
                 self._audit().other_logs(others)
-                self._audit().signed(number, signature, public_key)
+                self._audit().store_signature(number, signature, public_key)
                 self.signed.set()
             case messages.SignatureRefused(number, reason):
                 self._audit().refused(number, reason)

@@ -98,7 +98,7 @@ class SupervisorQuestions:
             raise MachineWorkFailedError(answer.reason)
         return answer.found
 
-    def answered(self, message: object) -> bool:
+    def take_answer(self, message: object) -> bool:
         """Give an answer to those who wait for it; return False for a message that answers no question."""
         match message:
             case messages.MachineWorkDone(number):
@@ -240,7 +240,7 @@ class ControlLifeline:
                 self.surroundings.firewall = message
             case messages.TunnelsEnclosed():
                 self._enclosed(message)
-            case _ if self.questions.answered(message):
+            case _ if self.questions.take_answer(message):
                 pass
             case _:
                 self._note(message)

@@ -12,7 +12,7 @@ import structlog
 from appliance.base.actors import OPERATOR
 from appliance.base.unix_sockets import KEEP_PATH
 from appliance.base.validation_messages import refused_field
-from appliance.base.withdrawal import awaited
+from appliance.base.withdrawal import withdrawable
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.channel.operations import AnyRequest
@@ -42,7 +42,7 @@ class AdminServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             while line := await reader.readline():
-                with awaited(lambda: _given_up(writer)):
+                with withdrawable(lambda: _given_up(writer)):
                     answer = await self.answer(line)
                 writer.write(admin.encode(answer) + b"\n")
                 await writer.drain()

@@ -30,7 +30,7 @@ class HandledAlarms:
         self._began = clock.now()
         ends.when_due(SILENCES, self._due)
 
-    def marked(self, status: Status) -> Status:
+    def with_marks(self, status: Status) -> Status:
         present = {alarm.kind for alarm in (*open_alarms(status), *activity(status))}
         self._awaited -= present
         if clock.now() - self._began >= _START_SECONDS:
@@ -39,7 +39,7 @@ class HandledAlarms:
         kept = {
             kind: row
             for kind, row in self._rows.items()
-            if (kind in present if row.until is None else not self._ends.passed(SILENCES, kind))
+            if (kind in present if row.until is None else not self._ends.is_over(SILENCES, kind))
         }
         if len(kept) < len(self._rows):
             self._keep(kept)

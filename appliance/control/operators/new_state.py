@@ -51,7 +51,7 @@ class StateAge:
         return self._record
 
     def _record(self, monitors: SpecificationManager) -> None:
-        on = [name for name in monitors.names() if monitors.switches.enabled(name)]
+        on = [name for name in monitors.names() if monitors.switches.is_enabled(name)]
         off = [name for name in monitors.names() if name not in on]
         without = f", without {', '.join(off)}" if off else ""
         text = (

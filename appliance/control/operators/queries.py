@@ -121,8 +121,8 @@ def topic_of(registry: Registry, relay: RelayControl, name: str) -> Topic:
 
 def _topic(registry: Registry, relay: RelayControl, name: str, connections: list[Connection]) -> Topic:
     publishing, subscribing = (
-        registry.registered(Kind.PUBLICATION, name),
-        registry.registered(Kind.SUBSCRIPTION, name),
+        registry.registrants(Kind.PUBLICATION, name),
+        registry.registrants(Kind.SUBSCRIPTION, name),
     )
     return Topic(
         name,

@@ -74,8 +74,8 @@ class TokenOrders:
         self._changed = changed
         ends.when_due(TOKENS, self._due)
 
-    async def listed(self, _request: admin.TokenList) -> answers.Tokens:
-        return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
+    async def list_tokens(self, _request: admin.TokenList) -> answers.Tokens:
+        return answers.Tokens([self._show(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
         """Return the usable tokens, as the api gets them; the api also checks `expires`."""
@@ -141,7 +141,7 @@ class TokenOrders:
             who=who or None,
         )
         try:
-            await self._store.settled()
+            await self._store.until_settled()
         except StoreError:  # the token's text was not shown, so end the token to free its name
             self._end(row, who)
             raise
@@ -162,7 +162,7 @@ class TokenOrders:
             self._require_room()
         row, text = make_token(name, last.role, now=now, seconds=seconds)
         until = now + request.grace
-        left = {one: self._ends.left(TOKENS, one.id) or 0.0 for one in earlier}
+        left = {one: self._ends.time_left(TOKENS, one.id) or 0.0 for one in earlier}
         ended = {
             one._replace(expires=min(one.expires, until))
             if request.grace
@@ -183,7 +183,7 @@ class TokenOrders:
         )
         self._rotating.add(name)
         try:
-            await self._store.settled()
+            await self._store.until_settled()
         except StoreError:
             if self._rows[row.id] is row:  # not revoked since
                 self._keep(left)
@@ -191,13 +191,13 @@ class TokenOrders:
             raise
         finally:
             self._rotating.discard(name)
-        return answers.RotatedToken(*_fields(row), token=text, earlier=[self._shown(one) for one in ended])
+        return answers.RotatedToken(*_fields(row), token=text, earlier=[self._show(one) for one in ended])
 
     async def revoke(self, request: admin.TokenRevoke, who: str = "") -> answers.Token:
         """End a name's tokens. Raises `TokenRefusedError` and `StoreError`."""
         ended = [self._end(row, who) for row in self._require_named(request.name)]
-        await self._store.settled()
-        return self._shown(ended[-1])
+        await self._store.until_settled()
+        return self._show(ended[-1])
 
     def _end(self, row: TokenRow, who: str, reason: str = "was revoked") -> TokenRow:
         revoked = row._replace(revoked=clock.wall())
@@ -251,14 +251,14 @@ class TokenOrders:
         self._changed()
 
     def _is_usable(self, row: TokenRow) -> bool:
-        return row.revoked is None and not self._ends.passed(TOKENS, row.id)
+        return row.revoked is None and not self._ends.is_over(TOKENS, row.id)
 
     def _date(self, row: TokenRow) -> TokenRow:
         """Return the token with its end by the present system clock."""
         date = self._ends.date(TOKENS, row.id)
         return row if date is None or abs(date - row.expires) < _SAME_DATE else row._replace(expires=date)
 
-    def _shown(self, row: TokenRow) -> answers.Token:
+    def _show(self, row: TokenRow) -> answers.Token:
         return answers.Token(*_fields(self._date(row)), self._uses.get(row.id), self._is_usable(row))
 
 

@@ -24,7 +24,7 @@ import structlog
 from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.base.withdrawal import awaited
+from appliance.base.withdrawal import withdrawable
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, ChallengeWanted, WaitingRequest, encode, verb_of
 from appliance.channel.channel import Channel, ChannelFullError
@@ -222,7 +222,7 @@ class RestLink:
             return gone or clock.now() > made.until
 
         host = made.asked.host if made.asked is not None else ""
-        with awaited(given_up, host):
+        with withdrawable(given_up, host):
             answer = await self._answer(made)
         if channel is self._link.channel:
             self._send_answer(made.number, answer)

@@ -24,7 +24,7 @@ from appliance.channel import admin
 from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import ClientRequest, RequestMade
 from appliance.channel.operations import CHANGES, RestRequest
-from appliance.channel.rest_meaning import NoOrderError, filled_in, meant
+from appliance.channel.rest_meaning import NoOrderError, filled_in, order_of
 from appliance.signing.bearer_secrets import is_hash_of
 from appliance.signing.request_signing import (
     HEADER,
@@ -163,7 +163,7 @@ class RequestAuthenticator:
             text = f"a bare token changes nothing here (api_require_proof): sign the order ({HEADER})"
             raise UnprovenError(text, row.name)
         try:
-            order = filled_in(meant(asked), made.request)
+            order = filled_in(order_of(asked), made.request)
         except NoOrderError as error:
             raise UnprovenError(
                 f"the order does not match its request: {error}", row.name, Severity.ALARM

@@ -84,13 +84,13 @@ def save_record(state: Path, record: AdoptRecord) -> None:
             write_whole(file, data, 0o644)
         except OSError as error:
             takes = record.phase is Phase.TAKING  # on a full disk nothing is granted, so nothing may be taken
-            if takes or not (is_full(error, state) and file.exists() and _overwritten(file, data)):
+            if takes or not (is_full(error, state) and file.exists() and _overwrite(file, data)):
                 raise
     except OSError as error:
         raise NetworkError(f"{file} cannot be written: {error.strerror}") from error
 
 
-def _overwritten(file: Path, data: bytes) -> bool:
+def _overwrite(file: Path, data: bytes) -> bool:
     """Write into the blocks that the file has: a full disk must not keep a graph from being given back."""
     with file.open("r+b", buffering=0) as opened:
         found = os.fstat(opened.fileno())

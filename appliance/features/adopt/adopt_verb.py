@@ -31,7 +31,7 @@ from appliance.features.adopt.adopt_answers import AdoptState, TakeOverReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, check_lines
 from appliance.features.adopt.adopt_record import Phase, load_record, save_record
 from appliance.features.adopt.machine_side import wanted_record
-from appliance.features.adopt.operator_orders import ADOPT, ordered
+from appliance.features.adopt.operator_orders import ADOPT, show_order
 from appliance.features.adopt.requests import AdoptOrder, AdoptStatus
 from appliance.features.adopt.robot_side import (
     WAITS,
@@ -166,13 +166,13 @@ def _wait(appliance: Appliance, state: Path, robot: CheckedRobot, within: float)
 def _adopt(appliance: Appliance, state: Path) -> Callable[[], None]:
     """Order the adoption, or note it for the start of an appliance; return what shows the outcome."""
     try:
-        with ordered(state, ADOPT):
+        with show_order(state, ADOPT):
             answer = appliance.ask(AdoptOrder())
     except NotRunningError:
         _note(state)
         return partial(say, "noted: the next start takes the graph over: sudo systemctl start rosrv")
     if answer.ok:
-        return partial(_show_report, answer.given(), as_json=appliance.as_json)
+        return partial(_show_report, answer.unwrap(), as_json=appliance.as_json)
     if not answer.error.startswith(WAITS):
         raise NetworkError(answer.error)
     _note(state)
@@ -195,7 +195,7 @@ def _await_start(appliance: Appliance) -> AdoptState:
             last = str(error)
             continue
         if answer.ok:
-            found = answer.given()
+            found = answer.unwrap()
             if found.phase == "taken":
                 return found
             last = found.obstacle or last

@@ -253,7 +253,7 @@ class AdoptPart:
             facts.record,
             present=facts.master is not None,
             obstacle=self._obstacle or facts.foreign_master,
-            nodes=len(self._graph.taken()),
+            nodes=len(self._graph.adopted_nodes()),
             not_started=sum(node.life is Life.LIVE for node in unasked),
             denied={" ".join(entry): why for entry, why in sorted(self._graph.denied.items())},
             missing=self._operation.left.nodes,
@@ -283,7 +283,7 @@ class AdoptPart:
 
     async def _stored(self) -> bool:
         try:
-            await self._core.store.settled()
+            await self._core.store.until_settled()
         except StoreError as error:
             log.warning("subscribers stay registered at the robot's own master", reason=str(error))
             return False

@@ -128,7 +128,7 @@ class AdoptedGraph:
         """Return the lists of the subscribers of `CLOCK` among adopted nodes."""
         nodes = [node for name in names if (node := self.registry.holder(name)) is not None]
         return {
-            (node, CLOCK): self.given(node, CLOCK)
+            (node, CLOCK): self.publishers_for(node, CLOCK)
             for node in nodes
             if CLOCK in node.resources(Kind.SUBSCRIPTION)
         }
@@ -136,7 +136,7 @@ class AdoptedGraph:
     def remind(self, node: Incarnation, topic: str) -> None:
         self.subscribers.remind(node, topic)
 
-    def given(self, node: Incarnation, topic: str) -> tuple[str, ...]:
+    def publishers_for(self, node: Incarnation, topic: str) -> tuple[str, ...]:
         """Return the appliance's URIs of a topic's publishers, as a subscriber has them."""
         return self.subscribers.publishers_for(node, topic)
 
@@ -148,11 +148,11 @@ class AdoptedGraph:
         """Return the nodes of the robot, also those that the policy or a failure suspended."""
         return [node for node in self.registry.all() if not node.own and node.life is not Life.REPLACED]
 
-    def taken(self) -> list[Incarnation]:
+    def adopted_nodes(self) -> list[Incarnation]:
         """Return the nodes of the robot that answer, and have a registration."""
         return [node for node in self.nodes() if node.life is Life.LIVE and node.registrations]
 
-    def held(self) -> Iterator[tuple[Entry, Incarnation]]:
+    def all_registrations(self) -> Iterator[tuple[Entry, Incarnation]]:
         """Yield all registrations. One that the policy withdrew still exists for its node, and a node that does not
         answer may only be slow.
         """

@@ -29,7 +29,7 @@ class _Order(msgspec.Struct, frozen=True):
 
 
 @contextlib.contextmanager
-def ordered(state: Path, what: Literal["adopt", "release"]) -> Iterator[None]:
+def show_order(state: Path, what: Literal["adopt", "release"]) -> Iterator[None]:
     """Show the order while control carries it out. Raises `NetworkError`, except where no appliance has run yet."""
     file = state / _FILE
     try:

@@ -98,7 +98,7 @@ async def has_service(uri: NodeUri, service: str) -> bool:
     return answer.get("md5sum", ANY) != ANY  # not of a program that sends back what it gets
 
 
-def parsed(nodes: Mapping[str, str]) -> tuple[dict[str, NodeUri], dict[str, str]]:
+def parse_places(nodes: Mapping[str, str]) -> tuple[dict[str, NodeUri], dict[str, str]]:
     """Return the URIs by the names of nodes, and the reasons why others are not valid."""
     valid, invalid = {}, {}
     for name, text in nodes.items():
@@ -120,7 +120,7 @@ async def find_places(nodes: Mapping[str, str], facts: MachineFacts, call: NodeC
     has a share of its own, so that no other host delays them. A host of which too many places fail is not asked
     further: registered URIs do not make it scan ports.
     """
-    uris, missing = parsed(nodes)
+    uris, missing = parse_places(nodes)
     places: dict[str, list[NodePlace]] = {}
     for name, uri in uris.items():
         possible = _possible(nodes[name], uri, facts)

@@ -30,7 +30,7 @@ from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, l
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.features.adopt.machine_side import master_of, start_stand_in
-from appliance.features.adopt.operator_orders import RELEASE, ordered
+from appliance.features.adopt.operator_orders import RELEASE, show_order
 from appliance.features.adopt.places import call_node
 from appliance.features.adopt.requests import AdoptStatus, ReleaseOrder
 from appliance.features.adopt.robot_side import MASTER_PORT, WAITS, remove_drop_ins, running_settings
@@ -110,7 +110,7 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
     with store.database.together():
         for key in keys:
             store.forget_incarnation(key)
-    await store.settled()
+    await store.until_settled()
     return report
 
 
@@ -294,7 +294,7 @@ def release(
 
 def _order(appliance: Appliance, state: Path) -> GiveBackReport:
     try:
-        with ordered(state, RELEASE):
+        with show_order(state, RELEASE):
             answer = appliance.ask(ReleaseOrder())
     except NotRunningError as error:
         raise NetworkError(f"{error}. After a crash: rosrv release --dead") from None
@@ -304,7 +304,7 @@ def _order(appliance: Appliance, state: Path) -> GiveBackReport:
             end_hold()
             return GiveBackReport()
         raise NetworkError(answer.error)
-    return answer.given()
+    return answer.unwrap()
 
 
 def end_hold() -> None:
@@ -320,12 +320,12 @@ def end_hold() -> None:
 def _stand(appliance: Appliance, within: float) -> None:
     try:
         adopted = appliance.ask(AdoptStatus())
-        if adopted.ok and adopted.given().phase == "free":
+        if adopted.ok and adopted.unwrap().phase == "free":
             return
         answer = appliance.ask(StatusWanted())
     except NotRunningError:
         return
-    if not answer.ok or not answer.given().monitors.enabled:
+    if not answer.ok or not answer.unwrap().monitors.enabled:
         return
     assert isinstance(appliance.way, AdminSocket)  # noqa: S101  the verb is given on this machine
     try:

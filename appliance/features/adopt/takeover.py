@@ -60,7 +60,7 @@ from appliance.features.adopt.places import (
     find_places,
     has_service,
     names_to_resolve,
-    parsed,
+    parse_places,
 )
 from appliance.features.adopt.subscriber_lists import (
     Subscription,
@@ -86,7 +86,7 @@ from appliance.rpc.master_reader import (
 from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError
 from appliance.supervisor.machine_work import Found
 from roswire.names import ROSOUT
-from roswire.parameter_tree import merged, same_value
+from roswire.parameter_tree import merge, same_value
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 
@@ -161,7 +161,7 @@ class LastWord:
     def of_nodes_that_answer(self) -> dict[Subscription, list[str]]:
         return {row: uris for row, uris in self.lists.items() if row[0].name not in self.failed}
 
-    def wanted(self, rows: Iterable[Subscription]) -> dict[Subscription, set[str]]:
+    def wanted_uris(self, rows: Iterable[Subscription]) -> dict[Subscription, set[str]]:
         """Return the URIs to which each of these shall connect; a node connects to itself without a socket."""
         wanted = {row: {*self.lists[row]} - {row[0].api_text} for row in rows}
         return {row: uris for row, uris in wanted.items() if uris}
@@ -391,7 +391,7 @@ class AdoptOperation:
         nodes = {name: uri for name, uri in graph.nodes.items() if not self.graph.is_own(name)}
         earlier, known = before or (MasterGraph(), Places())
         new = {name: uri for name, uri in nodes.items() if earlier.nodes.get(name) != uri}
-        uris, _invalid = parsed(new)
+        uris, _invalid = parse_places(new)
         places = await find_places(new, await self.facts(uris.values()), self.call)
         for name in nodes.keys() - new.keys():
             if name in known.found:
@@ -417,7 +417,7 @@ class AdoptOperation:
             kept = self.graph.nodes() and _KEPT_PARAMETER  # a node of RVMaster may have read it
             self._read_there = {name: value for name, value in mine.items() if name in there and name != kept}
             self.left.parameters = set()
-        wanted = merged(self._read_there, there, mine)
+        wanted = merge(self._read_there, there, mine)
         left = await _whole(self.parameters.take({
             name: wanted.get(name) for name in {**mine, **wanted} if not same_value(wanted.get(name), mine.get(name))
         }))  # fmt: skip
@@ -509,7 +509,7 @@ class AdoptOperation:
         began, reader = clock.now(), self.reader(facts)
         there = await reader.read()
         begun = await self._take_begun(there)
-        held = dict(self.graph.held())
+        held = dict(self.graph.all_registrations())
         unknown = [entry for entry in there.in_order() if self._is_gone(entry, there, held)]
         await reader.ask_all([_unregistration(entry, there) for entry in unknown])
         await self._give_parameters(reader, complete=False)
@@ -525,7 +525,7 @@ class AdoptOperation:
     async def _take_begun(self, there: MasterGraph) -> list[str]:
         """Take over the nodes of this machine that registered at their own master only; return their names."""
         held = {node.api_text for node in self.graph.nodes()}
-        uris, _invalid = parsed({
+        uris, _invalid = parse_places({
             name: uri for name, uri in there.nodes.items()
             if uri not in held and not self.graph.is_own(name) and self.graph.registry.occupant(name) is None
         })  # fmt: skip
@@ -540,7 +540,7 @@ class AdoptOperation:
         """Unregister the adopted subscriptions at the robot's own master, once they are on the disk here."""
         if facts.master is None or facts.foreign_master or not await self.stored():
             return
-        reader, held = self.reader(facts), dict(self.graph.held())
+        reader, held = self.reader(facts), dict(self.graph.all_registrations())
         there = await reader.read()
         adopted = [
             entry for entry in there.in_order()
@@ -552,7 +552,7 @@ class AdoptOperation:
 
     async def _cut_untold(self) -> None:
         """Ask nodes again that did not tell the port of their topics, and cut these. Raises `AdoptError`."""
-        nodes = [node for node in self.graph.taken() if node.name in self.left.untold]
+        nodes = [node for node in self.graph.adopted_nodes() if node.name in self.left.untold]
         self.left.untold = {node.name: self.left.untold[node.name] for node in nodes}
         if nodes:
             places = _places_of(nodes)
@@ -678,7 +678,7 @@ class AdoptOperation:
         return {uri: asked.get(uri) for uri in shares}
 
     def _entries(self, graph: MasterGraph) -> Iterable[Entry]:
-        return graph.entries or [entry for entry, _node in self.graph.held()]
+        return graph.entries or [entry for entry, _node in self.graph.all_registrations()]
 
     def _service_port(self, graph: MasterGraph, service: str, name: str) -> int:
         uri = graph.services.get(service, "")
@@ -689,7 +689,7 @@ class AdoptOperation:
         return int(tail) if tail.isascii() and tail.isdecimal() and int(tail) < 65_536 else 0
 
     def _report(self, cut: int, readings: int, left_out: list[str], seconds: float) -> TakeOverReport:
-        nodes = self.graph.taken()
+        nodes = self.graph.adopted_nodes()
         return TakeOverReport(
             nodes=len(nodes),
             hosts=sorted({str(node.host) for node in nodes}),
@@ -750,7 +750,7 @@ class AdoptOperation:
         # of calls that were under way
         more = await self._give_registrations(reader, after if known is None else known)
         there = await reader.parameters()
-        parameters += await self._set_parameters(reader, there, merged(before, self.parameters.tree(), there))
+        parameters += await self._set_parameters(reader, there, merge(before, self.parameters.tree(), there))
         await self.passed("give again")
         last = await self._last_word(await reader.read(), nodes)
         await self.passed("tell")
@@ -772,7 +772,7 @@ class AdoptOperation:
 
     def _nodes(self) -> list[HeldNode]:
         """Return the nodes, those of this machine first."""
-        held = list(self.graph.held())
+        held = list(self.graph.all_registrations())
         nodes = sorted(self.graph.nodes(), key=lambda node: not _place_of(node).is_here(self._facts))
         return [(node, {entry for entry, holder in held if holder is node}) for node in nodes]
 
@@ -835,7 +835,7 @@ class AdoptOperation:
         Return both numbers, and the graph after it. `known` is the graph since which nodes may have come directly to
         the robot's master; None: none can.
         """
-        there, held = await reader.read(), dict(self.graph.held())
+        there, held = await reader.read(), dict(self.graph.all_registrations())
         newer = set[str]() if known is None else await self._newer(there, held, known)
         gone = [
             entry
@@ -903,7 +903,7 @@ class AdoptOperation:
         changed at the robot's own master since RVMaster took it stays.
         """
         there = await reader.parameters()
-        wanted = merged(there if complete else self._read_there, there, self.parameters.tree())
+        wanted = merge(there if complete else self._read_there, there, self.parameters.tree())
         return await self._set_parameters(reader, there, wanted)
 
     async def _set_parameters(
@@ -940,11 +940,12 @@ class AdoptOperation:
         last = LastWord({(node, topic): lists.get(topic, []) for node, topic in subscriptions})
         rows = [row for row in subscriptions if row[1] != CLOCK]
         present = {
-            (node, topic): [*self.graph.given(node, topic)] if self.forwards else [] for node, topic in rows
+            (node, topic): [*self.graph.publishers_for(node, topic)] if self.forwards else []
+            for node, topic in rows
         }
         both = {row: [*dict.fromkeys((*last.lists[row], *present[row]))] for row in rows}
         await send_lists(self.call, _BESIDES_SECONDS, self._share, present, both)
-        await until_connected(self.call, last.wanted(rows))
+        await until_connected(self.call, last.wanted_uris(rows))
         final = {row: last.lists[row] for row in rows}
         last.failed = await send_lists(self.call, _LISTS_SECONDS, self._share, final)
         await self._remind(last, rows)
@@ -954,7 +955,7 @@ class AdoptOperation:
         """Send the last lists of these again to nodes that do not connect."""
         until = clock.now() + LAST_WORD_SECONDS
         for _ in range(_REMINDERS):
-            missing = await until_connected(self.call, last.wanted(rows))
+            missing = await until_connected(self.call, last.wanted_uris(rows))
             if not missing or clock.now() >= until:
                 return
             await send_lists(

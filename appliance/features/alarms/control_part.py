@@ -26,7 +26,7 @@ class AlarmOrders:
         self._trail = trail
         self._status = alarms.status
 
-    async def listed(self, _request: AlarmsWanted) -> AlarmList:
+    async def list_alarms(self, _request: AlarmsWanted) -> AlarmList:
         return self._list()
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
@@ -96,7 +96,7 @@ async def begin(core: Core) -> ControlPart:
         ).run
     return ControlPart(
         (
-            RequestMethod(AlarmsWanted, orders.listed, order=False),
+            RequestMethod(AlarmsWanted, orders.list_alarms, order=False),
             RequestMethod(AlarmAcknowledge, orders.acknowledge, who=True),
             RequestMethod(AlarmSilence, orders.silence, who=True),
         ),

@@ -62,7 +62,7 @@ def entries_of(status: Status) -> dict[str, Entry]:
     return found
 
 
-def encoded(entries: Mapping[str, Entry], sequence: int, node: str, robot: str) -> bytes:
+def encode_array(entries: Mapping[str, Entry], sequence: int, node: str, robot: str) -> bytes:
     seconds, nanoseconds = divmod(clock.wall_ns(), 1_000_000_000)
     parts = [
         entry.level
@@ -101,7 +101,7 @@ class Diagnostics:
         if levels == self._told and clock.now() - self._told_at < _PERIOD_SECONDS:
             return
         self._sequence += 1
-        data = encoded(present | ended, self._sequence, self._node, status.name)
+        data = encode_array(present | ended, self._sequence, self._node, status.name)
         with contextlib.suppress(ChannelFullError):  # the supervisor ends a relay that does not read
             self._relay.publish(OwnPublished(TOPIC, data))
             self._told, self._told_at = levels, clock.now()

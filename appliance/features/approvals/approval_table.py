@@ -161,7 +161,7 @@ class ApprovalTable:
             WAIT_SECONDS if seconds is None else seconds,
         )
 
-    def covered(self, entry: ApprovalEntry) -> list[ApprovalEntry]:
+    def equal_entries(self, entry: ApprovalEntry) -> list[ApprovalEntry]:
         """Return the other entries of the same host and name."""
         return [
             one
@@ -173,7 +173,7 @@ class ApprovalTable:
         return self._put(replace(entry, state=ApprovalState.REFUSED, who=who), WAIT_SECONDS)
 
     def seconds_left(self, entry: ApprovalEntry) -> float:
-        return self._ends.left(APPROVING, str(entry.number)) or 0.0
+        return self._ends.time_left(APPROVING, str(entry.number)) or 0.0
 
     def end_unanswered(self, entry: ApprovalEntry) -> None:
         """End a call that no operator answered, and keep its number for a repetition."""
@@ -193,7 +193,7 @@ class ApprovalTable:
             self._ends.forget(APPROVING, str(entry.number))
             self.pool.give_back(entry.charged)
 
-    def approved(self) -> frozenset[Approval]:
+    def approvals(self) -> frozenset[Approval]:
         """Return the approvals for some time on topics and parameters. Calls of services are decided one by one."""
         return frozenset(
             entry.call.approval

@@ -104,7 +104,7 @@ async def begin(core: Core) -> ControlPart:
     core.relay.hold(orders.hold_call, orders.approve_call)
     return ControlPart(
         (
-            RequestMethod(requests.ApprovalsWanted, orders.listed),
+            RequestMethod(requests.ApprovalsWanted, orders.list_approvals),
             RequestMethod(requests.ApproveCall, orders.approve, who=True, full_disk=True),
             RequestMethod(requests.RefuseCall, orders.refuse, who=True, full_disk=True),
         ),

@@ -82,13 +82,13 @@ class ApprovalOrders:
         self._still: dict[
             int, float
         ] = {}  # of approvals for some time: the last message before a silence about which guards were asked
-        self.approved = self._table.approved
+        self.approved = self._table.approvals
 
     # --- calls ---
 
     def hold_call(self, request: Request) -> CallHold:
         call = HeldCall(request.host, request.category, request.resource)
-        return self._held(call, request.caller_id)
+        return self._hold(call, request.caller_id)
 
     async def approve_call(self, wanted: RequestHeld) -> HeldRequestDecided:
         answer = partial(HeldRequestDecided, wanted.number)
@@ -114,13 +114,13 @@ class ApprovalOrders:
             self._end(entry, reason)
             approved = False
         if entry is None or not approved:
-            return self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size).of(decision)
+            return self._hold(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size).of(decision)
         if entry.once:
             self._table.end(entry)
             self._record("approval used", entry, f"used approval {entry.number}")
         return replace(decision, reason=f"{decision.reason}; approval {entry.number} by {entry.who}")
 
-    def _held(
+    def _hold(
         self, call: HeldCall, caller_id: str, type_: str = "", arguments: bytes = b"", size: int = 0
     ) -> CallHold:
         now = clock.now()
@@ -148,9 +148,9 @@ class ApprovalOrders:
 
     # --- operators ---
 
-    async def listed(self, _request: requests.ApprovalsWanted) -> requests.Approvals:
+    async def list_approvals(self, _request: requests.ApprovalsWanted) -> requests.Approvals:
         return requests.Approvals(
-            [self._shown(entry) for entry in sorted(self._table.entries(), key=lambda e: e.number)]
+            [self._show(entry) for entry in sorted(self._table.entries(), key=lambda e: e.number)]
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
@@ -176,7 +176,7 @@ class ApprovalOrders:
                 f"the policy no longer asks about {entry.call.resource}: there is nothing to approve"
             )
         take_effect()
-        for other in self._table.covered(entry) if seconds is not None else ():
+        for other in self._table.equal_entries(entry) if seconds is not None else ():
             self._end(other, f"approval {entry.number} covers it", who)
         credentials = frozenset(number for number, name in self._approvers().items() if name == who)
         earlier = entry.state.value
@@ -187,7 +187,7 @@ class ApprovalOrders:
         self._record("approval given", entry, text, who=who, earlier=earlier, now=f"approved {what}")
         if self._enforce():
             await self._carried_out({entry.call.resource})
-        return self._shown(entry)
+        return self._show(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
         """Refuse a held call, or end an approval. A refused call is not held again until its entry expires."""
@@ -197,12 +197,12 @@ class ApprovalOrders:
             self._end(entry, f"{who} ended it", who)
             self._enforce()
             await self._stop_motion(entry)
-            return self._shown(replace(entry, state=ApprovalState.REFUSED, who=who))
+            return self._show(replace(entry, state=ApprovalState.REFUSED, who=who))
         earlier = entry.state.value
         entry = self._table.refuse(entry, who)
         text = f"{who} refused approval {entry.number}"
         self._record("approval refused", entry, text, who=who, earlier=earlier, now=entry.state.value)
-        return self._shown(entry)
+        return self._show(entry)
 
     # --- the end of approvals ---
 
@@ -236,7 +236,7 @@ class ApprovalOrders:
         for entry in entries:
             silence, in_group = (
                 self._silence(entry),
-                self._policy().commanded(entry.call.resource) is not None,
+                self._policy().command_group(entry.call.resource) is not None,
             )
             if reason := self._ended(entry, approvers) or (silence if in_group else ""):
                 self._end(entry, reason)
@@ -270,7 +270,7 @@ class ApprovalOrders:
         return any(asking)  # a parameter may be held because of a rule for what is below it
 
     def _silence(self, entry: ApprovalEntry) -> str:
-        moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)
+        moved, group = self._last_message(entry), self._policy().command_group(entry.call.resource)
         seconds = SILENT_SECONDS if group is None else group.release_after
         about = entry.call.host, frozenset({entry.call.resource})
         silent = moved > entry.since and self._signs.silence(*about, moved) >= seconds
@@ -361,7 +361,7 @@ class ApprovalOrders:
             more=more,
         )
 
-    def _shown(self, entry: ApprovalEntry) -> requests.Approval:
+    def _show(self, entry: ApprovalEntry) -> requests.Approval:
         call = entry.call
         return requests.Approval(
             entry.number,

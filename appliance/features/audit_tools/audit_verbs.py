@@ -24,13 +24,13 @@ from appliance.audit.log.record_format import (
     as_object,
     fields_of,
     printable,
-    requested,
+    request_of,
     rule_text,
 )
 from appliance.audit.log.signatures import read_public_key
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import SignedCheckpoint, read_copies
-from appliance.audit.search.equality import FOLDED, EqualRecords, grouped, time_span
+from appliance.audit.search.equality import FOLDED, EqualRecords, group_equal, time_span
 from appliance.audit.search.filter_options import FILTER
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import LARGEST_PAGE, RecordInContext
@@ -49,7 +49,7 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import AuditSource, audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
-from appliance.features.audit_tools.unrecorded import unrecorded
+from appliance.features.audit_tools.unrecorded import unknown_names
 from appliance.features.views import pair_view
 from appliance.policy.host_names import HostInWords
 from appliance.policy.model import Category
@@ -68,7 +68,7 @@ _GAP = 2
 def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: bool = False) -> None:
     """Print records; on a terminal, equal records are one row unless `each`."""
     if sys.stdout.isatty():
-        rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
+        rows = [row for entry in entries for row in group_equal([entry])] if each else group_equal(entries)
         cells = [
             (Text(str(row.first.sequence)), Text(_times(row)), *_cells(row, host_in_words)) for row in rows
         ]
@@ -88,7 +88,7 @@ def line(entry: LogEntry, host_in_words: HostInWords) -> str:
         record.event,
         _host(record, host_in_words),
         record.caller_id,
-        requested(record),
+        request_of(record),
         record.resource,
         _parameter(record),
         _by(record),
@@ -154,7 +154,7 @@ def _cells(row: EqualRecords, host_in_words: HostInWords) -> tuple[Text, ...]:
         Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
         Text(printable(record.event), style="bold red" if alarming else ""),
         Text(_join(_host(record, host_in_words), record.caller_id, _by(record))),
-        Text(_join(requested(record), _monitor(record), record.resource, _parameter(record))),
+        Text(_join(request_of(record), _monitor(record), record.resource, _parameter(record))),
         Text(_why(record) if row.records == 1 else _why_of_several(row)),
     )
 
@@ -490,7 +490,7 @@ def _csv(entries: Iterator[LogEntry]) -> Iterator[tuple[int, str]]:
 def _filter_of(appliance: Appliance) -> Filter:
     """Return the filter, with networks instead of a host's name. Raises `FilterError`."""
     wanted = FILTER.value(appliance.params)
-    for warning in unrecorded(wanted):
+    for warning in unknown_names(wanted):
         note(printable(warning))
     if has_name(wanted) and appliance.place is None:  # over REST, the appliance looks the name up
         return with_networks(wanted, _known(appliance, wanted))
@@ -506,7 +506,7 @@ def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
         ) from None
     if not answer.ok:
         raise FilterError(f"--host {wanted.host}: {answer.error}")
-    return answer.given()
+    return answer.unwrap()
 
 
 def _print_lines(entries: list[LogEntry], appliance: Appliance) -> None:

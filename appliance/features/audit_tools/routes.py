@@ -14,7 +14,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.moments import given
+from appliance.api.front.moments import parse_moment
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Operator, Viewer, reads_contents
 from appliance.api.front.routing import Responses, Routes, file
@@ -41,7 +41,7 @@ from appliance.audit.search.query import Filter
 from appliance.audit.search.search import Follower, export, search
 from appliance.channel.answers.field_docs import doc
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
-from appliance.features.audit_tools.unrecorded import unrecorded
+from appliance.features.audit_tools.unrecorded import unknown_names
 from appliance.quotas.table import REST_STREAMS
 
 # Make the pages and streams of audit records that a client may read.
@@ -109,10 +109,10 @@ def page_of(
     page: dict[str, Any] = {"records": [as_object(entry) for entry in found[:limit]], "cursor": last}
     if equality:
         page["equality"] = [equality_of(entry.record) for entry in found[:limit]]
-    return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
+    return page | {"notes": notes} if (notes := unknown_names(wanted)) else page
 
 
-def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
+def to_row(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
     return as_object(entry) | ({"equality": equality_of(entry.record)} if equality else {})
 
 
@@ -132,7 +132,7 @@ def add_summary(router: Routes, audit_log: Path) -> None:
         limit: Annotated[int, Query(ge=1, le=LARGEST_SUMMARY, description="largest number of hosts")] = 20,
     ) -> DenialSummary:
         """The denials of each host: number, first and last time, most frequent rules or reasons, and callers."""
-        begin, end = (None if time is None else given(time) for time in (since, until))
+        begin, end = (None if time is None else parse_moment(time) for time in (since, until))
         async with one.turn(bearer):
             try:
                 return await asyncio.to_thread(
@@ -169,7 +169,7 @@ class LogCheckpoints(msgspec.Struct, frozen=True):
     checkpoints: Annotated[list[SignedCheckpoint], doc("checkpoints, in order")]
 
 
-def _wanted(
+def _filter(
     *,
     decision: Annotated[list[Literal["allow", "deny", "would deny", "ask"]] | None, Query()] = None,
     since: Annotated[str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")] = None,
@@ -207,8 +207,8 @@ def _wanted(
         raise ProblemError(422, "bad-input", "resource and topic mean the same: give one")
     return Filter(
         decision=tuple(dict.fromkeys([*(decision or ()), *(["deny"] if deny else [])])),
-        since=None if since is None else given(since),
-        until=None if until is None else given(until),
+        since=None if since is None else parse_moment(since),
+        until=None if until is None else parse_moment(until),
         host=host,
         caller_id=caller_id,
         resource=resource if topic is None else topic,
@@ -222,7 +222,7 @@ def _wanted(
     )
 
 
-Wanted = Annotated[Filter, Depends(_wanted)]
+Wanted = Annotated[Filter, Depends(_filter)]
 Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
 WithEquality = Annotated[bool, Query(description="1: also what makes equal records one row")]
 
@@ -256,7 +256,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
     ) -> JSONResponse:
         """Records that match, a page at a time; for viewers without contents of messages (`detail.withheld`)."""
         newest = order == "newest"
-        wanted = await desk.named(bearer, wanted)
+        wanted = await desk.resolve_names(bearer, wanted)
         return JSONResponse(
             await desk.read(
                 bearer,
@@ -288,7 +288,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         The stream ends when the token expires. A browser that reconnects continues after the last record it
         got.
         """
-        wanted = await desk.named(bearer, wanted)
+        wanted = await desk.resolve_names(bearer, wanted)
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(bearer, Follower, desk.path, wanted, start)
         give_back = streams.take(bearer, "clients follow the audit log")
@@ -332,7 +332,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records
         without contents of messages and without `chain`, because only complete records can be proven.
         """
-        wanted = await desk.named(bearer, wanted)
+        wanted = await desk.resolve_names(bearer, wanted)
         exported = _as_csv if form == "csv" else _export
         found = await desk.read(bearer, exported, desk.path, wanted, bearer, services.settings.name)
         give_back = services.exports.take(bearer, "exports")
@@ -370,7 +370,7 @@ async def _follow(
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in readable(entries, bearer, text):
             yield ServerSentEvent(
-                event="record", id=str(entry.sequence), data=_as_line(streamed(entry, equality=equality))
+                event="record", id=str(entry.sequence), data=_as_line(to_row(entry, equality=equality))
             )
         if not entries:
             with contextlib.suppress(TimeoutError):
@@ -380,18 +380,18 @@ async def _follow(
 
 def _export(path: Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:
     if reads_contents(bearer):
-        return _begun(evidence_line(*record, robot) for record in evidence(path, wanted))
+        return _start(evidence_line(*record, robot) for record in evidence(path, wanted))
     shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
     name = {"robot": robot} if robot else {}
-    return _begun(_as_line(as_object(entry) | name) for entries in shown for entry in entries)
+    return _start(_as_line(as_object(entry) | name) for entries in shown for entry in entries)
 
 
 def _as_csv(path: Path, wanted: Filter, bearer: Bearer, _robot: str) -> Iterator[str]:
     shown = (entry for found in export(path, wanted) for entry in readable([found], bearer, wanted.text))
-    return _begun(itertools.chain([csv_head()], (line for _sequence, line in csv_lines(shown))))
+    return _start(itertools.chain([csv_head()], (line for _sequence, line in csv_lines(shown))))
 
 
-def _begun(entries: Iterator[_T]) -> Iterator[_T]:
+def _start(entries: Iterator[_T]) -> Iterator[_T]:
     first = next(entries, None)
     return iter(()) if first is None else itertools.chain((first,), entries)
 

@@ -9,7 +9,7 @@ CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service
 """The categories of records, including some that the policy does not decide."""
 
 
-def unrecorded(wanted: Filter) -> list[str]:
+def unknown_names(wanted: Filter) -> list[str]:
     """Return a sentence for each unknown name, with the nearest known one. Globs are not checked."""
     return [
         f"this version records no {what} {name!r}{meant(name, known)}"

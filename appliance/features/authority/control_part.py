@@ -35,7 +35,7 @@ async def begin(core: Core) -> ControlPart:
         core,
         lambda: bool(policy.current().authority),
         lambda _host, topic: (
-            (group := policy.current().commanded(topic)) is not None and ranked.forgot(group)
+            (group := policy.current().command_group(topic)) is not None and ranked.forgot(group)
         ),
     )
     policy.provide(lambda known: known.with_holders(orders.holders()))

@@ -439,7 +439,7 @@ class DriveOrders:
     def _claim(self, group: AuthorityGroup, host: Address) -> Claim | None:
         policy = self._policy()
         current = policy.authority.get(group.name)
-        if current is None or policy.blocked(host) is not None:
+        if current is None or policy.block_of(host) is not None:
             return None
         return current.claim(policy.atoms_of(host))
 

@@ -144,12 +144,12 @@ class RankedGroups:
         """Let the guards stop what a lost driver commanded, one loss after the other."""
         while True:
             lost = await self._lost.get()
-            group, driver = self._policy().commanded(lost.topic), self._drivers.get(lost.topic)
+            group, driver = self._policy().command_group(lost.topic), self._drivers.get(lost.topic)
             if group is not None and driver is not None and driver.report == lost:
                 await self._stop(driver.host, {lost.topic}, f"{group.name}: {driver.why(group)}")
 
     def _on_report(self, report: RankReported) -> None:
-        group = self._policy().commanded(report.topic)
+        group = self._policy().command_group(report.topic)
         if group is None or not group.ranks:
             return
         before = self.driver(group)

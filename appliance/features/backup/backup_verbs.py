@@ -25,7 +25,7 @@ from appliance.features.backup.purge import purge as remove
 from appliance.features.backup.purge import require_state_directory
 from appliance.features.backup.restore import restore as put_back
 from rosmop.form.switch_words import without_file_switch
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 # Find the specifications in force that are only in a state directory, not in the folder of the configuration.
 
@@ -95,7 +95,7 @@ def backup(
     try:
         names = back_up(state, file, lambda name, copy: texts.update(specifications_in(name, copy)))
     except BackupError as error:
-        raise _failed(str(error)) from None
+        raise _failure(str(error)) from None
     size, only_here = file.stat().st_size, lacking_in_folder(state, texts)
     if as_json:
         say_json({"file": str(file), "files": len(names), "bytes": size, "only_in_state": only_here})
@@ -118,7 +118,7 @@ def restore(
     try:
         names = put_back(file, state)
     except BackupError as error:
-        raise _failed(str(error)) from None
+        raise _failure(str(error)) from None
     if as_json:
         say_json({"state": str(state), "files": len(names)})
     else:
@@ -147,17 +147,17 @@ def purge(
             if state.is_dir():
                 require_state_directory(state)
     except BackupError as error:
-        raise _failed(str(error)) from None
+        raise _failure(str(error)) from None
     confirm_state(context, state, f"This erases everything in {printable(str(state))} permanently")
     try:
         files, written = remove(state)
     except BackupError as error:
-        raise _failed(str(error)) from None
+        raise _failure(str(error)) from None
     if as_json:
         say_json({"state": str(state), "files": files, "written_over": written})
     else:
         say(f"{state} is erased: {counted(files, 'file')}, {written} of them overwritten first")
 
 
-def _failed(text: str) -> typer.Exit:
-    return refused([f"rosrv: {text}"])
+def _failure(text: str) -> typer.Exit:
+    return refusal([f"rosrv: {text}"])

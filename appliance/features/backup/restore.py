@@ -111,7 +111,7 @@ _SPARE = 64 << 20  # bytes of the disk that stay free
 
 
 def restore(file: Path, state: Path) -> list[str]:
-    with checked_archive(file, _room_in(state)) as (archive, entries), _marked(state):
+    with checked_archive(file, _room_in(state)) as (archive, entries), _mark(state):
         for entry in entries:
             _extract(archive, entry, state)
         if os.geteuid() == 0:
@@ -134,7 +134,7 @@ def _room_in(state: Path) -> int:
 
 
 @contextmanager
-def _marked(state: Path) -> Iterator[None]:
+def _mark(state: Path) -> Iterator[None]:
     """Mark the directory as incomplete. On an error, remove everything that was created."""
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)

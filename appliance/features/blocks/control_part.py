@@ -28,6 +28,6 @@ async def begin(core: Core) -> ControlPart:
         (
             RequestMethod(HostBlock, orders.block, who=True, full_disk=True),
             RequestMethod(HostUnblock, orders.unblock, who=True),
-            RequestMethod(HostBlocks, orders.listed, order=False),
+            RequestMethod(HostBlocks, orders.list_blocks, order=False),
         )
     )

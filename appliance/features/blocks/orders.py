@@ -71,7 +71,7 @@ class BlockOrders:
         self._carried_out = carried_out
         ends.when_due(BLOCKS, self._due)
 
-    async def listed(self, _request: HostBlocks) -> requests.BlockedHosts:
+    async def list_blocks(self, _request: HostBlocks) -> requests.BlockedHosts:
         return requests.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
 
     async def block(self, request: HostBlock, who: str) -> requests.HostBlocked:
@@ -117,7 +117,7 @@ class BlockOrders:
             ended=ended,
         )
         try:
-            await self._store.settled()
+            await self._store.until_settled()
         except StoreError as error:
             raise StoreError(
                 f"{address} is blocked now, but a stop of the appliance ends it: {error}"
@@ -149,7 +149,7 @@ class BlockOrders:
             earlier=_words(earlier),
             restored=restored,
         )
-        await self._store.settled()
+        await self._store.until_settled()
         await self._carried_out()
         return requests.HostUnblocked(**asdict(shown), restored=restored)
 

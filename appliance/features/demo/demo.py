@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from appliance.base.shipped import SHIPPED
-from rosmop.tool.terminal import refused
+from rosmop.tool.terminal import refusal
 
 
 def demo(
@@ -48,15 +48,15 @@ def demo(
     """
     if not (SHIPPED / "examples").is_dir():
         why = f"the simulated robot is missing from {SHIPPED}: install rosrv again"
-        raise refused([f"rosrv demo: {why}; beside the container it is `docker compose --profile demo up`"])
+        raise refusal([f"rosrv demo: {why}; beside the container it is `docker compose --profile demo up`"])
     if (standby or adopt) and output is not None:
-        raise refused(
+        raise refusal(
             [
                 "rosrv demo: --output draws the drives of the demonstration without --standby and --adopt: leave it out"
             ]
         )
     if standby and adopt:
-        raise refused(["rosrv demo: --standby and --adopt are two demonstrations: give one"])
+        raise refusal(["rosrv demo: --standby and --adopt are two demonstrations: give one"])
     sys.path.insert(0, str(SHIPPED))
     demonstration = importlib.import_module("examples.landshark.demonstration")
     raise typer.Exit(

@@ -38,7 +38,7 @@ async def begin(core: Core) -> ControlPart:
     core.limits.provide(orders.limits)
     return ControlPart(
         (
-            RequestMethod(requests.DoorsWanted, orders.listed),
+            RequestMethod(requests.DoorsWanted, orders.list_doors),
             RequestMethod(requests.DoorAdd, orders.add, who=True),
             RequestMethod(requests.DoorRemove, orders.remove, who=True, full_disk=True),
             RequestMethod(requests.DoorTicket, orders.ticket, who=True),

@@ -175,7 +175,7 @@ class _Publication:
 
     def publish(self, values: Raw | bytes, memory: ClientMemory) -> None:
         raw = isinstance(values, Raw)
-        self.publication.publish(_written(self.type.codec.writer, values, memory) if raw else values)
+        self.publication.publish(_write(self.type.codec.writer, values, memory) if raw else values)
 
 
 @dataclass(slots=True)
@@ -201,7 +201,7 @@ class DoorNode:
         self.node = node
         self.time = ProcessorTime(lambda host: host)
         self._hosts = hosts
-        self._topics = DOOR_TOPICS.bounds.sized(most_topics)
+        self._topics = DOOR_TOPICS.bounds.resize(most_topics)
         self._calls = calls
         self.waiting_calls = of_hosts("calls of this door that wait for answers", DOOR_CALLS.bounds.whole)
         self._types = types
@@ -325,7 +325,7 @@ class DoorNode:
                     with self._refusing_all(request):
                         publication = await self.node.advertise(
                             request.topic,
-                            MessageType.defined(kind.definitions, kind.name),
+                            MessageType.of(kind.definitions, kind.name),
                             latched=request.latched,
                             queue=request.queue,
                             replay=_REPLAY_SECONDS,
@@ -538,7 +538,7 @@ class DoorNode:
             return
         clients, kind = heard.clients, header.get("type", ANY)
         shared = self._frames if receivers is None and len(clients) > 1 else None
-        message = DoorMessage(topic, body, header, clock.wall_ns(), heard.known, shared)
+        message = DoorMessage(topic, body, header, clock.wall_ns(), heard.known_type, shared)
         now = asyncio.get_running_loop().time()
         wrong = []
         for client in clients if receivers is None else receivers:
@@ -577,7 +577,7 @@ class DoorNode:
         if heard is None or heard.header is None or self._types.key(heard.header) not in self._present(topic):
             return None
         try:
-            return heard.known(heard.header)
+            return heard.known_type(heard.header)
         except DefinitionError:
             return None
 
@@ -636,7 +636,7 @@ class DoorNode:
         if not isinstance(request.values, Raw):
             return await self.node.call_service(request.service, md5sum, request.values, seconds)
         writer = sent.codec.writer
-        body = _written(writer, _named(request.values, writer.fields), self._calls)
+        body = _write(writer, _by_name(request.values, writer.fields), self._calls)
         return received.codec.json(await self.node.call_service(request.service, md5sum, body, seconds))
 
     async def _offer(self, request: OfferService, client: DoorClient) -> None:
@@ -663,7 +663,7 @@ class DoorNode:
                 client.give_up(call)
 
         try:
-            await self.node.offer(request.service, ServiceType.defined(definitions, request.type), answer)
+            await self.node.offer(request.service, ServiceType.of(definitions, request.type), answer)
         except BaseException:
             del self._offers[request.service]
             raise
@@ -683,7 +683,7 @@ class DoorNode:
             raise ProtocolError(f"no call of {request.service} waits for this answer")
         try:
             # As in rosbridge, values that fit are the answer, whatever `result` is: some clients send false.
-            future.set_result(_written(offer.response.codec.writer, request.values, client.memory))
+            future.set_result(_write(offer.response.codec.writer, request.values, client.memory))
         except PeerError as error:
             reason = str(error) if request.ok else bytes(request.values)[:1000].decode("utf-8", "replace")
             future.set_exception(ServiceFailedError(reason))
@@ -725,7 +725,7 @@ class DoorNode:
         return lock
 
 
-def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
+def _write(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
     cost = writer.cost(values)
     with memory.holding(cost) if cost > _SMALL_BYTES else contextlib.nullcontext():
         return writer.from_json(values, present_time())
@@ -733,10 +733,10 @@ def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -
 
 def _check_will(request: AdvertiseTopic, kind: KnownType, memory: ClientMemory) -> None:
     if request.will is not None:
-        _written(kind.codec.writer, request.will, memory)  # raises if it does not fit
+        _write(kind.codec.writer, request.will, memory)  # raises if it does not fit
 
 
-def _named(values: Raw, names: list[str]) -> bytes:
+def _by_name(values: Raw, names: list[str]) -> bytes:
     """Return the arguments by name. A client may give them as a list in the order of the fields."""
     text = bytes(values)
     if not text.lstrip().startswith(b"["):

@@ -24,7 +24,7 @@ from appliance.features.doors.client_requests import (
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.host_shares import check_share
 from appliance.features.doors.quotas import DOOR_PARAMETERS
-from roswire.errors import LimitExceededError, ProtocolError, RosError, quoted
+from roswire.errors import LimitExceededError, ProtocolError, RosError, quote
 from roswire.node import MasterDenialError, RosNode
 from roswire.node.network import OwnedTasks
 from roswire.xmlrpc import Value
@@ -125,7 +125,7 @@ class DoorParameters:
         try:
             value = msgspec.json.decode(request.value)
         except (ValueError, RecursionError) as error:  # such as 1e999
-            raise ProtocolError(f"the value of {quoted(request.name)}: {error}") from None
+            raise ProtocolError(f"the value of {quote(request.name)}: {error}") from None
         await self._node.set_parameter(request.name, value)
 
     async def carry_out(

@@ -126,7 +126,7 @@ class DoorTable:
     def in_slot(self, slot: int) -> DoorRow | None:
         return next((row for row in self.live() if row.slot == slot), None)
 
-    def planned(self, name: str, port: int | None, source: str) -> DoorRow:
+    def plan(self, name: str, port: int | None, source: str) -> DoorRow:
         self._require_name(name)
         if source and port is None:
             raise SenselessError("--from needs --port: only agents are known by their address")

@@ -33,7 +33,7 @@ class DoorTickets:
 
     def valid(self, door: str | None = None) -> list[TicketRow]:
         """Return the tickets that have not ended, with their ends by the present system clock."""
-        self._due([ticket for ticket in self._rows if self._ends.passed(TICKETS, ticket)])
+        self._due([ticket for ticket in self._rows if self._ends.is_over(TICKETS, ticket)])
         return [
             row._replace(expires=self._ends.date(TICKETS, row.id) or row.expires)
             for row in self._rows.values()
@@ -55,10 +55,10 @@ class DoorTickets:
 
     def find(self, door: str, text: str) -> TicketRow | None:
         row = TICKET_FORM.find(text, self._rows)
-        return None if row is None or row.door != door or self._ends.passed(TICKETS, row.id) else row
+        return None if row is None or row.door != door or self._ends.is_over(TICKETS, row.id) else row
 
-    def ended(self, ticket: str) -> bool:
-        return ticket not in self._rows or self._ends.passed(TICKETS, ticket)
+    def has_ended(self, ticket: str) -> bool:
+        return ticket not in self._rows or self._ends.is_over(TICKETS, ticket)
 
     def forget(self, door: str) -> None:
         self._due([row.id for row in self.valid(door)])
@@ -136,7 +136,7 @@ class DoorVisits:
     def present(self, door: str) -> list[TicketRow]:
         return [visit.row for visit in self._visits.values() if visit.row.door == door and not visit.replaced]
 
-    def ended(self) -> list[tuple[TicketRow, bool]]:
+    def pop_ended(self) -> list[tuple[TicketRow, bool]]:
         """Remove and return the visits that have ended, and whether a newer one replaced them."""
         if not self._visits:
             return []
@@ -157,6 +157,6 @@ class DoorVisits:
         return (
             not visit.used
             and not visit.replaced
-            and not self._ends.passed(VISITS, visit.row.id)
+            and not self._ends.is_over(VISITS, visit.row.id)
             and not visit.credentials.isdisjoint(self._bearers())
         )

@@ -48,7 +48,7 @@ from appliance.features.doors.foxglove_frames import (
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic
 from appliance.features.doors.viewer_queue import ViewerQueue
-from roswire.errors import DefinitionError, PeerError, quoted
+from roswire.errors import DefinitionError, PeerError, quote
 from roswire.names import resolve, resolve_parameter
 from roswire.xmlrpc import Value
 
@@ -192,7 +192,7 @@ class Foxglove:
 
     def _advertise_channel(self, one: FoxgloveChannel) -> DoorRequest:
         if one.encoding not in _ENCODINGS:
-            raise _FoxgloveError(f"the encoding {quoted(one.encoding)}; use {' or '.join(_ENCODINGS)}")
+            raise _FoxgloveError(f"the encoding {quote(one.encoding)}; use {' or '.join(_ENCODINGS)}")
         if one.id in self._channels:
             raise _FoxgloveError(f"the channel {one.id} exists; unadvertise it first")
         if len(self._channels) >= self._limits.channels:
@@ -238,7 +238,7 @@ class Foxglove:
         if seen is None:
             reason = f"the service {service} is not announced"
         elif start > len(frame) or encoding != "ros1":
-            reason = f"the encoding {quoted(encoding)} of a service call; use ros1"
+            reason = f"the encoding {quote(encoding)} of a service call; use ros1"
         elif len(self._calls) >= self._limits.calls:
             waiting = counted(len(self._calls), "call of this client waits", "calls of this client wait")
             reason = f"{waiting} for answers; repeat it later"

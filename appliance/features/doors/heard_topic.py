@@ -60,7 +60,7 @@ class HeardTopic(Generic[Client]):
         self.told[key] = reason
         return True
 
-    def known(self, header: Mapping[str, str]) -> KnownType:
+    def known_type(self, header: Mapping[str, str]) -> KnownType:
         """Raise `DefinitionError` if the definition cannot be used."""
         if self._known is not None and same_text(header, self._known[0]):
             return self._known[1]

@@ -192,7 +192,7 @@ class KnownTypes:
         self._differing: list[Differing] = []
 
     def define(self, given: Definitions) -> None:
-        self._definitions = self._standard.extended(given)
+        self._definitions = self._standard.merge(given)
         self._defined.forget()
         self._failed.clear()
 

@@ -125,14 +125,14 @@ class DoorOrders:
         # By ticket: the door to which connections were passed, also by an earlier control.
         self._used = {row.id: row.door for row in tickets.valid()}
 
-    async def listed(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
-        return door_requests.DoorList([self._shown(row) for row in self._table.live()])
+    async def list_doors(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
+        return door_requests.DoorList([self._show(row) for row in self._table.live()])
 
     async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.DoorState:
         async with self._one:
             if self._table.stray:
                 raise UnavailableError(self._table.stray)
-            row = self._table.planned(request.name, request.port, request.source)
+            row = self._table.plan(request.name, request.port, request.source)
             if row.port is not None and row.port in self._core.policy.current().ports:
                 raise SenselessError(f"port {row.port} is in [Ports] range of the policy: choose another one")
             settings = self._core.settings
@@ -158,12 +158,12 @@ class DoorOrders:
                 port=row.port,
                 source=row.source,
             )
-            await self._core.store.settled()
-            return self._shown(row)
+            await self._core.store.until_settled()
+            return self._show(row)
 
     async def remove(self, request: door_requests.DoorRemove, who: str) -> door_requests.DoorState:
         async with self._one:
-            shown = self._shown(self._table.of(request.name))
+            shown = self._show(self._table.of(request.name))
             take_effect()
             row = self._table.remove(request.name)
             self._tickets.forget(row.name)
@@ -185,7 +185,7 @@ class DoorOrders:
             )
             if row.port is not None and (problem := await self._open(self._table.ports())):
                 _log.error("the port of a door stays open in the firewall", port=row.port, reason=problem)
-            await self._core.store.settled()
+            await self._core.store.until_settled()
             await self._core.relay.carried_out()
             return shown
 
@@ -196,14 +196,14 @@ class DoorOrders:
         self._record_ticket(
             door, row, f"ticket {row.id} opens the door {door.name} for {request.seconds:g} s"
         )
-        await self._core.store.settled()
+        await self._core.store.until_settled()
         return _new_ticket(row, text)
 
     # --- the caller's own door ---
 
     async def own(self, _request: door_requests.OwnDoorWanted, who: str) -> door_requests.OwnDoor:
         name, row, reason = self._own.of(who)
-        return door_requests.OwnDoor(name=name, door=None if row is None else self._shown(row), reason=reason)
+        return door_requests.OwnDoor(name=name, door=None if row is None else self._show(row), reason=reason)
 
     async def visit(self, _request: door_requests.DoorVisit, who: str) -> door_requests.NewTicket:
         _name, door, reason = self._own.of(who)
@@ -237,7 +237,7 @@ class DoorOrders:
         return problem
 
     def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        if self._core.policy.current().blocked(address_of(peer)) is not None:
+        if self._core.policy.current().block_of(address_of(peer)) is not None:
             self._refuse_entry(peer, door, "the host is blocked by an operator")
             return 403, "this host is blocked by an operator"
         row = next((one for one in self._table.live() if one.name == door), None)
@@ -268,9 +268,9 @@ class DoorOrders:
             self._viewers.tell(
                 (row.name, self._processes.health(row).connections) for row in self._table.live()
             )
-            for visit, replaced in self._visits.ended():
+            for visit, replaced in self._visits.pop_ended():
                 self._end_ticket(visit.door, visit.id, replaced=replaced)
-            for ticket in [one for one in self._used if self._tickets.ended(one)]:
+            for ticket in [one for one in self._used if self._tickets.has_ended(one)]:
                 self._end_ticket(self._used.pop(ticket), ticket)
             if number % _RETRY_SECONDS == 0:
                 with contextlib.suppress(OSError):
@@ -302,7 +302,7 @@ class DoorOrders:
             ),
         )
 
-    def _shown(self, row: DoorRow) -> door_requests.DoorState:
+    def _show(self, row: DoorRow) -> door_requests.DoorState:
         counts, trouble = self._processes.state(row)
         return door_requests.DoorState(
             name=row.name,

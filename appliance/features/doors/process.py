@@ -148,13 +148,13 @@ class CountedClient:
     def sample(self) -> None:
         self._samples.append(self._counts())
 
-    def shown(self) -> ClientShown:
+    def describe(self) -> ClientShown:
         lately = (now - before for now, before in zip(self._counts(), self._samples[0], strict=True))
         return ClientShown(self.peer, self.ticket, self.session.protocol_name, self._since, *lately)
 
 
-def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
-    oldest_first = sorted((client.shown() for client in clients), key=lambda one: one.since)
+def describe_clients(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
+    oldest_first = sorted((client.describe() for client in clients), key=lambda one: one.since)
     yield from oldest_first[:MAX_SHOWN]
 
 
@@ -498,7 +498,7 @@ class DoorProcess:
     def _show_clients(self, *, sample: bool, changed: bool) -> None:
         if not sample and not changed:
             return
-        clients = [*shown(self._clients)]
+        clients = [*describe_clients(self._clients)]
         if clients != self._shown and self._child.tell(door_link.ClientsShown(clients)):
             self._shown = clients
         for client in self._clients if sample else ():

@@ -16,7 +16,7 @@ from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.message_writer import Now
 from appliance.features.doors.surroundings import DoorSurroundings, VisibleGraph
 from roswire.definitions import Definitions
-from roswire.errors import ProtocolError, quoted
+from roswire.errors import ProtocolError, quote
 from roswire.message_text import PRIMITIVES, MessageDefinition
 from roswire.node import RosNode
 from roswire.xmlrpc import Value
@@ -156,7 +156,7 @@ class Rosapi:
             return None
         row = self._answers.get(request.service.removeprefix(_PREFIX))
         if row is None:
-            return _fail(f"rosapi has no service {quoted(request.service)}")
+            return _fail(f"rosapi has no service {quote(request.service)}")
         return self._answer(*row, bytes(request.values))
 
     async def _answer(self, fields: tuple[str, ...], answer: _Answer, values: bytes) -> Raw:
@@ -251,7 +251,7 @@ class Rosapi:
         versions = {one.fingerprint: one for one in seen}
         if len(versions) > 1:
             words = " and ".join(f"{version.topic} ({version.md5sum})" for version in versions.values())
-            raise ProtocolError(f"{quoted(given.type)} has several definitions: {words}")
+            raise ProtocolError(f"{quote(given.type)} has several definitions: {words}")
         for one in seen:
             return {"typedefs": typedefs(Definitions.from_full_text(one.type, one.definition), one.type)}
         return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}  # raises

@@ -54,7 +54,7 @@ from appliance.features.doors.rosbridge_frames import (
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
-from roswire.errors import PeerError, quoted
+from roswire.errors import PeerError, quote
 from roswire.names import resolve
 from roswire.xmlrpc import Value
 
@@ -282,7 +282,7 @@ class Rosbridge:
     def _withdraw(self, operation: UnadvertiseServiceOp) -> list[DoorRequest]:
         service = self._resolve_name(operation.service)
         if self._forget_text(self._services, service) is None:
-            raise OperationError(f"this client does not offer the service {quoted(operation.service)}")
+            raise OperationError(f"this client does not offer the service {quote(operation.service)}")
         for call in [call for call, name in self._asked.items() if name == service]:
             self.give_up(call)
         return [WithdrawService(service, operation.id)]
@@ -291,7 +291,7 @@ class Rosbridge:
         call = operation.id
         service = self._forget_text(self._asked, call) if isinstance(call, str) else None
         if service is None or not isinstance(call, str):
-            raise OperationError(f"no call of {quoted(operation.service)} has this id")
+            raise OperationError(f"no call of {quote(operation.service)} has this id")
         return [AnswerCall(service, call, operation.result, operation.values, operation.id)]
 
     def _set_level(self, operation: SetLevelOp) -> list[DoorRequest]:

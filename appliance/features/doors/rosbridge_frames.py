@@ -12,7 +12,7 @@ from appliance.features.doors.client_frames import ClientFrame, binary_frame, te
 from appliance.features.doors.client_requests import ClientId
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.values import cbor
-from roswire.errors import PeerError, quoted
+from roswire.errors import PeerError, quote
 
 _MAX_CHARACTERS = 1024
 _MAX_INTEGER = (1 << 63) - 1
@@ -175,7 +175,7 @@ def type_name(text: str) -> str:
     """Return `PACKAGE/NAME` without the additional slashes that rosbridge accepts."""
     parts = [part for part in text.split("/") if part]
     if len(parts) != 2:
-        raise OperationError(f"{quoted(text)} is not a type; write PACKAGE/NAME")
+        raise OperationError(f"{quote(text)} is not a type; write PACKAGE/NAME")
     return "/".join(parts)
 
 
@@ -209,7 +209,7 @@ def _complaint(text: bytes, error: Exception) -> str:
     if envelope.op == "fragment":
         return "a door joins no fragments: send the whole operation in one frame"
     if envelope.op not in OPERATIONS:
-        return f"unknown operation {quoted(str(envelope.op))}; the operations are {', '.join(OPERATIONS)}"
+        return f"unknown operation {quote(str(envelope.op))}; the operations are {', '.join(OPERATIONS)}"
     return f"{envelope.op}: {error}"
 
 

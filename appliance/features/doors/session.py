@@ -79,7 +79,7 @@ class RefusalCounts:
         self._times: dict[str, deque[float]] = {}
         self._held_until = 0.0
 
-    def exceeded(self, topic: str, reason: str, now: float) -> bool:
+    def count_refusal(self, topic: str, reason: str, now: float) -> bool:
         """Count a refusal of a topic (empty: of a call). Return whether the client must be disconnected."""
         if HELD in reason:
             self._held_until = now + _HELD_SECONDS
@@ -431,7 +431,7 @@ class DoorSession:
     def _note_refusal(self, request: DoorRequest, reason: str) -> None:
         if isinstance(request, AdvertiseTopic | PublishMessage | CallOfService):
             topic = "" if isinstance(request, CallOfService) else request.topic
-            if self._refusals.exceeded(topic, reason, asyncio.get_running_loop().time()):
+            if self._refusals.count_refusal(topic, reason, asyncio.get_running_loop().time()):
                 self.disconnect(f"{MAX_REFUSALS} refusals in {REFUSAL_SECONDS:g} s: {reason}")
 
     def _note_will(self, request: DoorRequest) -> None:

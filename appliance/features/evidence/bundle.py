@@ -110,16 +110,14 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Na
         recording = _recording(ask, wanted.id)
         bag = wanted.folder / wanted.id / "recording.bag"
         wanted = TimeSpan(recording.began, recording.ended + 1)
-    _given(ask(LogSealed()))
+    _body(ask(LogSealed()))
     span = TimeSpan(wanted.since, min(wanted.until, clock.wall_ns()))
     bundle = _Bundle(log, span, ask, recording, bag, names)
     manifest = bundle.manifest()
     text = json.dumps(manifest, indent=1).encode() + b"\n"
     order = EvidenceExported(hashlib.sha256(text).hexdigest(), *span, bundle.count, manifest["recording"])
-    proof = _proof(log, _given(ask(order)).record)
-    return _zipped(
-        itertools.chain(bundle.checked(manifest), [("manifest.json", [text]), ("proof.json", [proof])])
-    )
+    proof = _proof(log, _body(ask(order)).record)
+    return _zip(itertools.chain(bundle.check(manifest), [("manifest.json", [text]), ("proof.json", [proof])]))
 
 
 def _recording(ask: Ask, recording_id: str) -> RecordingSummary:
@@ -128,7 +126,7 @@ def _recording(ask: Ask, recording_id: str) -> RecordingSummary:
         raise BundleError(
             "this appliance has no flight recorder: give --since instead of a recording", "unknown"
         )
-    recording: RecordingSummary = _given(ask(fetch(recording_id)))
+    recording: RecordingSummary = _body(ask(fetch(recording_id)))
     return recording
 
 
@@ -200,11 +198,11 @@ class _Bundle:
             manifest["members"][name] = {"sha256": digest.hexdigest(), "bytes": size}
         return manifest
 
-    def checked(self, manifest: dict[str, Any]) -> Iterator[Member]:
+    def check(self, manifest: dict[str, Any]) -> Iterator[Member]:
         left = dict(manifest["members"])
         for name, pieces in self.members({**manifest, "missing": [*manifest["missing"]]}):
             digest = hashlib.sha256()
-            yield name, _noted(pieces, digest.update)
+            yield name, _note_each(pieces, digest.update)
             if left.pop(name, {}).get("sha256") != digest.hexdigest():
                 raise BundleError(f"{name} changed during the export: export again", "failed")
         if left:
@@ -245,7 +243,7 @@ class _Bundle:
             yield "recording/recording.bag", _file(self._bag)
         page = Page(self._recording, self._names)
         within = itertools.chain.from_iterable(range(first, last + 1) for first, last in self._runs)
-        yield "records.ndjson", _noted(_records(self._log, heapq.merge(self._alone, within)), page.add)
+        yield "records.ndjson", _note_each(_records(self._log, heapq.merge(self._alone, within)), page.add)
         yield "index.html", (page.html(manifest) for _once in "1")
 
     def _text(
@@ -255,16 +253,16 @@ class _Bundle:
             return None
         answer: AdminAnswer[A] = self._ask(request)
         wanted = self._hashes.pop(place, None)  # the second time, a text is compared with the first
-        if answer.trouble == "unknown" or (wanted is not None and hash_of(_given(answer)) != wanted):
+        if answer.trouble == "unknown" or (wanted is not None and hash_of(_body(answer)) != wanted):
             manifest["missing"].append(place)
             return None
-        return _given(answer)
+        return _body(answer)
 
 
-def _given(answer: AdminAnswer[A]) -> A:
+def _body(answer: AdminAnswer[A]) -> A:
     if not answer.ok:
         raise BundleError(answer.error, answer.trouble)
-    return answer.given()
+    return answer.unwrap()
 
 
 def _named(texts: RevisionTexts) -> dict[str, str]:
@@ -295,7 +293,7 @@ def _signatures(signatures: dict[str, str]) -> Iterator[Member]:
     return ((f"signatures/{name}.sig", [text.encode()]) for name, text in signatures.items() if text)
 
 
-def _noted(pieces: Iterable[bytes], note: Callable[[bytes], object]) -> Iterator[bytes]:
+def _note_each(pieces: Iterable[bytes], note: Callable[[bytes], object]) -> Iterator[bytes]:
     for piece in pieces:
         note(piece)
         yield piece
@@ -349,7 +347,7 @@ class _Pipe(io.RawIOBase):
         return taken
 
 
-def _zipped(members: Iterable[Member]) -> Iterator[bytes]:
+def _zip(members: Iterable[Member]) -> Iterator[bytes]:
     pipe = _Pipe()
     with zipfile.ZipFile(pipe, "w") as archive:
         for name, pieces in members:

@@ -7,7 +7,7 @@ from fastapi import Query, Response
 from starlette.responses import StreamingResponse
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.moments import given
+from appliance.api.front.moments import parse_moment
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.recording_id import OneId
 from appliance.api.front.route_roles import Investigator, Reader, problem_of
@@ -36,7 +36,7 @@ def routes(services: Services) -> Routes:
 
         For investigators, operators and admins. The audit log records each export.
         """
-        return await _bundle(services, bearer, TimeSpan(given(since), given(until)))
+        return await _bundle(services, bearer, TimeSpan(parse_moment(since), parse_moment(until)))
 
     @router.get("/recordings/{recording_id:recording}/evidence", responses=_ZIP, response_class=Response)
     async def recording_evidence(recording_id: OneId, bearer: Investigator) -> Response:
@@ -56,7 +56,7 @@ async def _bundle(services: Services, bearer: Bearer, wanted: TimeSpan | Recordi
     give_back = services.exports.take(bearer, "exports")
     try:
         policy = await services.control.ask(PolicyWanted(), bearer)
-        named = await asyncio.to_thread(host_in_words, policy.given() if policy.ok else None)
+        named = await asyncio.to_thread(host_in_words, policy.unwrap() if policy.ok else None)
         names = Names(services.settings.name, named)
         pieces = await asyncio.to_thread(export, services.audit_log, wanted, ask, names)
     except BaseException as error:

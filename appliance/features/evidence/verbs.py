@@ -113,7 +113,7 @@ def _bundle(appliance: Appliance, wanted: str | TimeSpan) -> Iterator[bytes]:
                 path = f"/v1/recordings/{quote(wanted, safe='')}/evidence"
             else:
                 params = {"since": rfc3339(wanted.since), "until": rfc3339(wanted.until)}
-            with client.streamed("GET", path, params=params, seconds=_SILENCE_SECONDS) as answer:
+            with client.stream("GET", path, params=params, seconds=_SILENCE_SECONDS) as answer:
                 yield from answer.iter_bytes()
 
 

@@ -237,7 +237,7 @@ class BundleGate:
         if self._record.trial is not None:
             await self._undo_interrupted(self._record, self._record.trial)
         if self._record.policy_back:
-            self._earlier = await self._policies.compiled(self._record.policy_back)
+            self._earlier = await self._policies.compile_revision(self._record.policy_back)
         self._known = clock.now() + _KNOWN_SECONDS
         while self._fleet.bundles.root is not None:
             self._state()
@@ -517,7 +517,7 @@ class BundleGate:
 
     async def _keep(self, record: BundleRecord) -> None:
         self._save(record)
-        await self._store.settled()
+        await self._store.until_settled()
 
     def _save(self, record: BundleRecord) -> None:
         self._record = record

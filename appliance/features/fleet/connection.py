@@ -103,7 +103,7 @@ class CollectorConnection:
         """Yield the parts of an event stream until it ends or is silent."""
         with self._exchange("GET", path, [("Accept", "text/event-stream")]) as answer:
             self._deadline.begin(_SILENT_SECONDS)
-            for part in _checked(path, answer).iter_stream():
+            for part in _check(path, answer).iter_stream():
                 yield part
                 self._deadline.begin(_SILENT_SECONDS)
 
@@ -130,7 +130,7 @@ class CollectorConnection:
         sent: Any = [*self._headers, *headers]  # httpcore takes text and bytes, but its types say one of them
         url = f"{self.url}/{path}"
         try:
-            with self._connected().stream(
+            with self._connect().stream(
                 method, url, headers=sent, content=content, extensions=self._extensions
             ) as answer:
                 yield answer
@@ -147,7 +147,7 @@ class CollectorConnection:
                 )
             raise CollectorError(f"{self.url}/{path.partition('?')[0]}: {reason}") from error
 
-    def _connected(self) -> httpcore.HTTPConnection:
+    def _connect(self) -> httpcore.HTTPConnection:
         if self._connection is None or not self.is_open:
             self.close()
             self._connection = httpcore.HTTPConnection(
@@ -165,7 +165,7 @@ class _Deadline:
         self.seconds = seconds
         self._end = clock.now() + seconds
 
-    def left(self) -> float:
+    def remaining(self) -> float:
         left = self._end - clock.now()
         if left <= 0:
             raise httpcore.TimeoutException
@@ -185,7 +185,7 @@ class _Network(httpcore.NetworkBackend):
         socket_options: Iterable[httpcore.SOCKET_OPTION] | None = None,
     ) -> httpcore.NetworkStream:
         stream = httpcore.SyncBackend().connect_tcp(
-            host, port, self._deadline.left(), local_address, socket_options
+            host, port, self._deadline.remaining(), local_address, socket_options
         )
         return _Stream(stream, self._deadline)
 
@@ -196,11 +196,11 @@ class _Stream(httpcore.NetworkStream):
         self._deadline = deadline
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:  # noqa: ARG002  the deadline counts
-        return self._stream.read(max_bytes, self._deadline.left())
+        return self._stream.read(max_bytes, self._deadline.remaining())
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:  # noqa: ARG002  the deadline counts
         for start in range(0, len(buffer), _PART):
-            self._stream.write(buffer[start : start + _PART], self._deadline.left())
+            self._stream.write(buffer[start : start + _PART], self._deadline.remaining())
 
     def close(self) -> None:
         self._stream.close()
@@ -212,7 +212,7 @@ class _Stream(httpcore.NetworkStream):
         timeout: float | None = None,  # noqa: ARG002  the deadline counts
     ) -> httpcore.NetworkStream:
         try:
-            left = self._deadline.left()
+            left = self._deadline.remaining()
         except httpcore.TimeoutException:
             self.close()  # as httpcore's own streams do when the handshake fails
             raise
@@ -224,7 +224,7 @@ class _Stream(httpcore.NetworkStream):
 
 def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[bytes]:
     size = 0
-    for part in _checked(path, answer).iter_stream():
+    for part in _check(path, answer).iter_stream():
         size += len(part)
         if size > longest:
             raise CollectorError(
@@ -234,7 +234,7 @@ def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[byt
         yield part
 
 
-def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
+def _check(path: str, answer: httpcore.Response) -> httpcore.Response:
     if _header(answer, b"content-encoding") not in (b"", b"identity"):
         raise CollectorError(
             f"{path}: the answer is compressed: a proxy before the collector must not do that"

@@ -67,7 +67,7 @@ class Poller:
         stated = self.stated()
         if stated is None:
             return _jitter(_BACK_OFF[0])
-        pause = self._checked(stated)
+        pause = self._check(stated)
         self._report(self.stated() or stated)
         return pause
 
@@ -76,13 +76,13 @@ class Poller:
         if stated is not None:
             self._report(stated)
 
-    def _checked(self, stated: BundleStated) -> float:
+    def _check(self, stated: BundleStated) -> float:
         self._early, offers = "", False
         try:
             self.bundles.refresh()
-            selected = self.bundles.selected()
+            selected = self.bundles.fetch_selected()
             if selected is not None and _is_news(selected, stated):
-                self.offer(_offered(self.bundles.get(selected)))
+                self.offer(_offer(self.bundles.get(selected)))
                 offers = True
         except BundleTooEarlyError as error:
             self._early = str(error)
@@ -147,7 +147,7 @@ def _is_news(selected: SelectedBundle, stated: BundleStated) -> bool:
     return bundle not in ((stated.in_force, stated.sha256), refused and (refused.path, refused.sha256))
 
 
-def _offered(bundle: VerifiedBundle) -> BundleOffered:
+def _offer(bundle: VerifiedBundle) -> BundleOffered:
     return BundleOffered(str(bundle.path), bundle.sha256, bundle.contents)
 
 

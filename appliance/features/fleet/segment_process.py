@@ -108,9 +108,9 @@ class SegmentPusher:
     def _begin(self) -> PushPosition:
         log, upto = _newest_signed(self.log)
         lowest = next_segment(self.log, 0) or 1
-        kept = self._kept()
+        kept = self._stored_position()
         if kept is None or kept.log != log:
-            self._store(PushPosition(log, 0, _removed(self.log)))
+            self._store(PushPosition(log, 0, _removed_through(self.log)))
         position, step = PushPosition(log, 0, self._kept_sequence(log, 0)), 1
         while upto > 0:
             head = msgspec.json.decode(self.collector.get(f"v1/logs/{log}?upto={upto}"), type=StoredHead)
@@ -134,14 +134,14 @@ class SegmentPusher:
         self._look(position)
         return position
 
-    def _kept(self) -> PushPosition | None:
+    def _stored_position(self) -> PushPosition | None:
         try:
             return msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
         except (FileNotFoundError, ValueError):
             return None
 
     def _kept_sequence(self, log: str, number: int) -> int | None:
-        kept = self._kept()
+        kept = self._stored_position()
         return kept.sequence if kept is not None and (kept.log, kept.number) == (log, number) else None
 
     def _store(self, position: PushPosition) -> None:
@@ -297,7 +297,7 @@ def _newest_signed(log: Path) -> tuple[str, int]:
         return log_id(connection), number
 
 
-def _removed(log: Path) -> int:
+def _removed_through(log: Path) -> int:
     """Return the sequence before the first record."""
     with reading(log, advice="") as connection:
         first, _last = record_extent(connection)

@@ -8,7 +8,7 @@ from appliance.cli.output import say_json
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.fleet.requests import BundleTake
 from appliance.features.fleet.view import BundlesState
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 _VERB = "rosrv fleet"
 
@@ -26,7 +26,7 @@ def take(appliance: Appliance, *, when_standing: WhenStanding = False, within: W
     state: BundlesState | None = asdict(appliance.ask_or_exit(StatusWanted())).get("bundles")
     if state is None or not state.for_order:
         why = "" if state is None or not state.trouble else f": {state.trouble}"
-        raise refused([printable(f"{_VERB}: no bundle waits for an order{why}")])
+        raise refusal([printable(f"{_VERB}: no bundle waits for an order{why}")])
     if when_standing:
         stand_or_exit(appliance, within, _VERB)
     body = appliance.ask_or_exit(BundleTake(state.for_order))

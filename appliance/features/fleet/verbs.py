@@ -30,7 +30,7 @@ from appliance.formats.fleet_membership import (
 from appliance.ipsec.signer import PUBLIC_KEY_FILE
 from appliance.signing.own_certificate import make_own_certificate, untimely
 from appliance.supervisor.users import account_of
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 _VERB = "rosrv fleet"
 _DAYS = 825
@@ -78,9 +78,9 @@ def join(
         (state / FOLDER / _USED_FOR).unlink()
     except CollectorError as error:
         advice = "; run the command again with the same invitation" if error.status is None else ""
-        raise refused([f"{_VERB}: {error}{advice}"]) from None
+        raise refusal([f"{_VERB}: {error}{advice}"]) from None
     except OSError as error:
-        raise refused(
+        raise refusal(
             [f"{_VERB}: {error.filename or state}: {error.strerror or error}; run this as root"]
         ) from None
     fingerprint = hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate)).hexdigest()

@@ -136,7 +136,7 @@ class VerifiedBundles:
                 self._sync()
         self._updater = updater
 
-    def selected(self) -> SelectedBundle | None:
+    def fetch_selected(self) -> SelectedBundle | None:
         """Return the bundle that the collector selects, or None. Call `refresh` before.
 
         Raise `BundleTooEarlyError` if the robot's ring may not take the bundle yet.

@@ -20,10 +20,10 @@ from appliance.features.guards.fitness import GuardFitness
 from appliance.features.guards.guard_answers import DriverCheck
 from appliance.features.guards.guard_facts import facts_of
 from appliance.features.guards.guard_orders import GuardOrders
-from appliance.features.guards.presets import DRIVER_CHECK, GuardError, described, text_of
+from appliance.features.guards.presets import DRIVER_CHECK, GuardError, description_of, text_of
 from appliance.features.guards.proof_tests import ProofTests, kept_tests
 from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
-from appliance.features.guards.upgrades import planned
+from appliance.features.guards.upgrades import plan
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.writer_thread import StoreError
@@ -69,7 +69,7 @@ class DriverChecks:
     def methods(self) -> tuple[RequestMethod[object], ...]:
         return (
             RequestMethod(DriverCheckBegin, self.begin, who=True),
-            RequestMethod(DriverCheckWanted, self.wanted, order=False),
+            RequestMethod(DriverCheckWanted, self.check_drivers, order=False),
         )
 
     async def begin(self, request: DriverCheckBegin, who: str) -> DriverCheck:
@@ -84,7 +84,7 @@ class DriverChecks:
             raise SenselessError("specifications wait for rosrv monitor confirm: confirm them, or wait")
         text, seconds = self._text(request), request.patience + request.seconds
         order = admin.MonitorLoad(
-            {_FILE: text}, note=described(text), confirm_within=seconds + _LIMIT_SECONDS
+            {_FILE: text}, note=description_of(text), confirm_within=seconds + _LIMIT_SECONDS
         )  # fmt: skip
         before, relays = self._check, self._pids()
         self._check, self._who = DriverCheck(request.command, request.by), who
@@ -97,11 +97,11 @@ class DriverChecks:
         monitors.records.told.append(self._on_report)
         self._asked_at, self._until = clock.now(), clock.now() + seconds + _FURTHER_SECONDS
         self._relays = relays
-        if not monitors.switches.enabled(NAME):
+        if not monitors.switches.is_enabled(NAME):
             self._end("interrupted", None, "a new monitor is in shadow mode here (--enable shadow)")
         return self._check
 
-    async def wanted(self, _request: DriverCheckWanted) -> DriverCheck:
+    async def check_drivers(self, _request: DriverCheckWanted) -> DriverCheck:
         self._asked_at = clock.now()
         if self._under_way():
             with contextlib.suppress(TimeoutError):
@@ -144,7 +144,7 @@ class DriverChecks:
         try:
             monitors, request = self._monitors, admin.MonitorRemove([_FILE])
             # A change during the check has its time limit, or one of its own. Control may have restarted.
-            settled = monitors.in_force.note == described(monitors.sources.files[_FILE])
+            settled = monitors.in_force.note == description_of(monitors.sources.files[_FILE])
             await monitors.remove(request, self._who or NAME, settled=settled)
         except (SpecificationsRefusedError, StoreError) as error:
             _log.warning("the monitor of a driver check is not removed yet", error=str(error))
@@ -178,7 +178,7 @@ class DriverChecks:
         values = {"longest": f"{request.seconds:g}", "patience": f"{request.patience:g}"}
         topics = {"command": request.command, "by": request.by}
         try:
-            text = text_of(planned(DRIVER_CHECK, NAME, topics, facts_of(self._graph()), values, {}))
+            text = text_of(plan(DRIVER_CHECK, NAME, topics, facts_of(self._graph()), values, {}))
         except GuardError as error:
             raise SenselessError(str(error)) from error
         return text + "".join(f"\norder {name} < {NAME};" for name in self._monitors.checked.monitors) + "\n"

@@ -51,7 +51,7 @@ class GuardFitness:
 
     def look(self, guards: Iterable[str]) -> None:
         names, now = [*guards], clock.now()
-        found = {name: self._added(name, now) for name in names}
+        found = {name: self._add(name, now) for name in names}
         self.times = {name: times for name, times in found.items() if times.timed}
         self._counted = {name: row for name, row in self._counted.items() if name in found}
         self._grown = {name: at for name, at in self._grown.items() if name in found}
@@ -88,7 +88,7 @@ class GuardFitness:
             reasons.append("no guard is in force")
         return next(filter(None, reasons), "")
 
-    def _added(self, name: str, now: float) -> GuardTimes:
+    def _add(self, name: str, now: float) -> GuardTimes:
         times = self.times.get(name)
         if times is None or times.limit != self._limit:
             times = GuardTimes(clock.wall(), 0.0, 0, 0, 0.0, self._limit)

@@ -30,7 +30,7 @@ from appliance.features.guards.presets import (
     GuardError,
     Preset,
     below_the_standard,
-    described,
+    description_of,
     former_guard,
     is_former,
     keeps_state,
@@ -46,7 +46,7 @@ from appliance.features.guards.presets import (
 from appliance.features.guards.released import origin_of
 from appliance.features.guards.robot_graph import RobotGraph
 from appliance.features.guards.suggestions import advice, inside
-from appliance.features.guards.upgrades import Upgrade, planned, same, upgraded
+from appliance.features.guards.upgrades import Upgrade, plan, same, upgrade_of
 from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState, OlderGuard
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
@@ -103,7 +103,7 @@ class Placement:
 
     @property
     def bypassed(self) -> list[BypassedGuard]:
-        return [_bypassed(driver, uris) for driver, uris in sorted(self._confirmed.items())]
+        return [_bypass_of(driver, uris) for driver, uris in sorted(self._confirmed.items())]
 
     @property
     def unanswered(self) -> list[str]:
@@ -137,7 +137,7 @@ class Placement:
         self._suspected[driver] = {*uris}
         if again:
             if driver not in self._confirmed:
-                self._report(_bypassed(driver, again))
+                self._report(_bypass_of(driver, again))
             self._confirmed[driver] = again
         elif not uris:
             self._confirmed.pop(driver, None)
@@ -170,7 +170,7 @@ class Placement:
                 yield f"{topic}: the base is on {host}: a cut between here and there is not guarded"
 
 
-def _bypassed(driver: GuardedDriver, uris: list[str]) -> BypassedGuard:
+def _bypass_of(driver: GuardedDriver, uris: list[str]) -> BypassedGuard:
     return BypassedGuard(driver.topic, driver.node, driver.host, uris)
 
 
@@ -275,7 +275,7 @@ class GuardOrders:
             place.bypassed,
             place.unanswered,
             {name: self._monitors.lasting(name) for name in guards
-             if name not in switches.said and not switches.enabled(name)},
+             if name not in switches.said and not switches.is_enabled(name)},
             [*self._older(guards)],
             former,
             dict(fitness.late),
@@ -286,7 +286,7 @@ class GuardOrders:
     def _older(self, guards: Mapping[str, Preset]) -> Iterator[OlderGuard]:
         for name, guard in guards.items():
             present = PRESETS[guard.name].version
-            if guard.version < present and self._monitors.switches.enabled(name):
+            if guard.version < present and self._monitors.switches.is_enabled(name):
                 edited = origin_of(guard.text) == "changed"
                 yield OlderGuard(name, guard.name, guard.version, present, edited)
 
@@ -317,11 +317,11 @@ class GuardOrders:
         return advice(facts_of(self._graph()), loaded, self._monitors.checked.monitors)
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
-        file, text = self._made(request)
+        file, text = self._make(request)
         if self._monitors.sources.files.get(file) == text:
-            return self._monitors.replaced(self._monitors.revision, loaded=[file]).in_lines()
+            return self._monitors.replacement(self._monitors.revision, loaded=[file]).in_lines()
         order = admin.MonitorLoad(
-            {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
+            {file: text}, note=description_of(text), expected=request.expected, confirm_within=request.confirm_within,
             shadow=request.shadow, hold=request.hold,
         )  # fmt: skip
         loaded = await self._monitors.load(order, who, enable=not request.shadow)
@@ -332,11 +332,11 @@ class GuardOrders:
 
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         monitors, name = self._monitors, request.name
-        text, changed, constants = self._changed(name, request.values)
+        text, changed, constants = self._change(name, request.values)
         given: dict[str, dict[str, GivenValue]] = {name: dict(constants)} if constants else {}
         if changed != text:  # one change of both, so that none of them is in force without the other
             order = admin.MonitorLoad(
-                {monitors.checked.monitors[name]: changed}, note=described(changed), expected=request.expected,
+                {monitors.checked.monitors[name]: changed}, note=description_of(changed), expected=request.expected,
                 shadow=monitors.switches.in_shadow(name), hold=request.hold, given=given,
             )  # fmt: skip
             await monitors.load(order, who)
@@ -348,10 +348,10 @@ class GuardOrders:
     async def upgrade(self, request: guard_requests.GuardUpgrade, who: str) -> Replacement:
         monitors, name = self._monitors, request.name
         if origin_of(self._guard(name)[1]) == "current":
-            return monitors.replaced(monitors.revision).in_lines()
+            return monitors.replacement(monitors.revision).in_lines()
         new = self._upgrade(name, request.topics)
         order = admin.MonitorLoad(
-            {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
+            {monitors.checked.monitors[name]: new.text}, note=description_of(new.text), expected=request.expected,
             confirm_within=request.confirm_within, shadow=monitors.switches.in_shadow(name), hold=request.hold,
         )  # fmt: skip
         loaded = await monitors.load(order, who)
@@ -363,36 +363,36 @@ class GuardOrders:
         changed: dict[str, list[str]] = {}
         kept: list[str] = []
         if request.preset:
-            file, text = self._made(request)
+            file, text = self._make(request)
             shadow = request.shadow or monitors.switches.starts_in_shadow
             off, topics, stops = False, topics_in(text), 0
             changed = {each: ["", value] for each, value in request.values.items()}
             kept = self.placement.sentences(request.topics["command"])
         else:
-            present, text, _constants = self._changed(name, request.values)
+            present, text, _constants = self._change(name, request.values)
             if request.upgrade:
                 new = self._upgrade(name, request.topics)
                 text, kept = new.text, new.warnings
             file = "" if text == present else monitors.checked.monitors[name]
             row = self._row(name, self._guards()[name])
             shadow = monitors.switches.in_shadow(name) and not request.enforce
-            off = not shadow and not request.enforce and not monitors.switches.enabled(name)
+            off = not shadow and not request.enforce and not monitors.switches.is_enabled(name)
             topics, stops = row.topics, row.stops
             before = row.loads | {one.name: _written(one.value) for one in row.given if one.kind != "topic"}
             after = {
-                each: self._guards()[name].parameter(each).checked(to) for each, to in request.values.items()
+                each: self._guards()[name].parameter(each).check(to) for each, to in request.values.items()
             }
             changed = {each: [before[each], to] for each, to in after.items() if not same(before[each], to)}
             if request.upgrade:
                 changed = {**new.changed}
-        warnings, refused = await self._judged(request, file, text, who, shadow=shadow)
+        warnings, refused = await self._judge(request, file, text, who, shadow=shadow)
         begins = bool(file) and not (request.values and keeps_state(text, request.values))
         return GuardPlan(
             monitors.revision, monitors.tag, name, file, text if file else "", begins, shadow, changed, topics,
             stops, kept + warnings, refused, off,
         )  # fmt: skip
 
-    async def _judged(
+    async def _judge(
         self, request: guard_requests.GuardTry, file: str, text: str, who: str, *, shadow: bool
     ) -> tuple[list[str], list[str]]:
         warnings: list[str] = []
@@ -407,13 +407,13 @@ class GuardOrders:
             return warnings, error.findings
         return warnings, []
 
-    def _made(self, request: guard_requests.GuardNew | guard_requests.GuardTry) -> tuple[str, str]:
+    def _make(self, request: guard_requests.GuardNew | guard_requests.GuardTry) -> tuple[str, str]:
         try:
             if "command" not in request.topics:
                 raise GuardError("topics has no `command`: name the topic to guard, such as /cmd_vel")
             name, graph = request.name or request.preset, facts_of(self._graph())
             preset = preset_named(request.preset)
-            guard = planned(preset, name, request.topics, graph, request.values, request.types)
+            guard = plan(preset, name, request.topics, graph, request.values, request.types)
             shadow = request.shadow or self._monitors.switches.starts_in_shadow
             text = text_of(replace(guard, switch="shadow" if shadow else "on"))
             file = f"{name}.rv"
@@ -433,14 +433,14 @@ class GuardOrders:
             in_force = {
                 one.name: _written(one.value) for one in self._row(name, preset).given if one.kind != "topic"
             }
-            return upgraded(text, in_force, facts_of(self._graph()), topics, self._monitors.lasting(name))
+            return upgrade_of(text, in_force, facts_of(self._graph()), topics, self._monitors.lasting(name))
         except GuardError as error:
             raise SenselessError(str(error)) from error
 
-    def _changed(self, name: str, values: Mapping[str, str]) -> tuple[str, str, dict[str, str]]:
+    def _change(self, name: str, values: Mapping[str, str]) -> tuple[str, str, dict[str, str]]:
         preset, text = self._guard(name)
         try:
-            checked = {each: preset.parameter(each).checked(value) for each, value in values.items()}
+            checked = {each: preset.parameter(each).check(value) for each, value in values.items()}
             in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
             changed = with_values(text, in_text)
         except GuardError as error:
@@ -515,7 +515,7 @@ class GuardOrders:
             return "holding"
         if monitors.switches.in_shadow(name):
             return "shadow"
-        if not monitors.switches.enabled(name):
+        if not monitors.switches.is_enabled(name):
             return "off"
         if name in monitors.checked.unbuilt:
             return "broken"

@@ -74,14 +74,14 @@ class Parameter:
             return value != bound
         return not _COMPARISONS[sign](float(value), float(bound))
 
-    def checked(self, value: str) -> str:
+    def check(self, value: str) -> str:
         if self.kind == "bool":
             if value not in {"true", "false"}:
                 raise GuardError(f"{self.name}={value}: write {self.name}=true or {self.name}=false")
             return value
         if self.loads:
             try:
-                return given_lists.normalised(self.kind, value)
+                return given_lists.normalise(self.kind, value)
             except ValueError as error:
                 why = f"{error}; " if str(error) else ""
                 example = f"write it like {self.name}='{given_lists.EXAMPLES[self.kind]}'"
@@ -248,10 +248,10 @@ def text_of(guard: Guard) -> str:
             _require_type(preset, name, kind, topics[name])
             types[name] = kind
     settings = {name: f"{topic} {types[name]}" if name in types else topic for name, topic in topics.items()}
-    settings |= {name: preset.parameter(name).checked(value) for name, value in guard.values.items()}
+    settings |= {name: preset.parameter(name).check(value) for name, value in guard.values.items()}
     head = head_of(preset.text)
     assert head is not None  # noqa: S101  a test reads every preset
-    return _written(replace(head, name=guard.name, settings=settings, switch=guard.switch or ""), preset.body)
+    return _write(replace(head, name=guard.name, settings=settings, switch=guard.switch or ""), preset.body)
 
 
 def _require_topic(preset: Preset, name: str, topic: str) -> None:
@@ -270,7 +270,7 @@ def _require_type(preset: Preset, name: str, kind: str, topic: str) -> None:
         raise GuardError(f"{topic} has the type {kind}; {preset.name} works with {works_with(types)}{hint}")
 
 
-def _written(head: Head, body: str) -> str:
+def _write(head: Head, body: str) -> str:
     settings = "".join(f"    {name} = {value};\n" for name, value in head.settings.items())
     switch = f" {head.switch}" if head.switch else ""
     return f"preset {head.preset} {head.version} as {head.name}{switch} {{\n{settings}}}\n{body}"
@@ -331,7 +331,7 @@ def below_the_standard(preset: Preset, values: Mapping[str, str]) -> list[str]:
     ]
 
 
-def described(text: str) -> str:
+def description_of(text: str) -> str:
     head = head_of(text)
     if head is None:
         return ""
@@ -391,8 +391,8 @@ def with_values(text: str, values: Mapping[str, str]) -> str:
         raise GuardError(
             "it was not made from a preset; change its source, and load it with rosrv monitor load"
         )
-    checked = {name: preset.parameter(name).checked(value) for name, value in values.items()}
-    return _written(replace(head, settings={**head.settings, **checked}), body_of(text))
+    checked = {name: preset.parameter(name).check(value) for name, value in values.items()}
+    return _write(replace(head, settings={**head.settings, **checked}), body_of(text))
 
 
 def keeps_state(text: str, names: Collection[str]) -> bool:

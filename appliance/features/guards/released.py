@@ -26,7 +26,7 @@ def origin_of(text: str) -> Origin:
     own = without_order(text)
     preset = PRESETS[loaded.name]
     try:
-        base = preset if loaded.version == preset.version else released(loaded.name, loaded.version)
+        base = preset if loaded.version == preset.version else released_preset(loaded.name, loaded.version)
         unchanged = _is_of(own, base)
     except (FileNotFoundError, GuardError):
         return "changed"
@@ -44,7 +44,7 @@ def _is_of(text: str, base: Preset) -> bool:
     return text in {presets.text_of(guard), base.text}
 
 
-def released(name: str, version: int) -> Preset:
+def released_preset(name: str, version: int) -> Preset:
     """Return the released version of a preset. Raises `FileNotFoundError`."""
     text = (FOLDER / f"{name}-{version}.rv").read_text(encoding="utf-8")
     return replace(PRESETS[name], source=text)

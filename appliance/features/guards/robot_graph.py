@@ -304,7 +304,7 @@ class RobotGraph:
             and (not COMMAND.search(topic.name) or self.ends(command).issuperset(topic.publishers))
         ]  # fmt: skip
 
-    def shared(self, kinds: Iterable[str]) -> list[TopicFacts]:
+    def shared_topics(self, kinds: Iterable[str]) -> list[TopicFacts]:
         """Return the published topics of these types that are below no robot's namespace, and belong to none."""
         wanted, commands = {*kinds}, [robot.commands[0] for robot in self.robots]
         return [
@@ -370,7 +370,7 @@ class RobotGraph:
         wanted = {*kinds}
         return any(topic.type in wanted and node in topic.publishers for topic in self.topics)
 
-    def unguarded(self, kinds: Collection[str]) -> list[TopicFacts]:
+    def unguarded_topics(self, kinds: Collection[str]) -> list[TopicFacts]:
         """Return topics that no preset works with: with both ends and a command's name, or goals of a driver."""
         drivers = frozenset(node for robot in self.robots for node in robot.drivers)
         return [

@@ -11,7 +11,7 @@ from appliance.features.guards.guard_words import origin_in_words, state_in_word
 from appliance.features.guards.requests import GuardsWanted
 from appliance.features.guards.verbs import GuardName
 from rosmop.tool.tables import add_row, say_table, table_of
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 _REMARK = re.compile(r"^ {4}(\w.*?;) +// (.+)$", re.MULTILINE)
 _NAME = re.compile(r"\b([A-Za-z_]\w*)(?:\[[^]]*\])?\s*(?:=[^,;]*)?[,;]")
@@ -34,7 +34,7 @@ def show(
     row = next((guard for guard in guards if guard.name == name), None)
     if row is None:
         known = ", ".join(guard.name for guard in guards) or "none is loaded"
-        raise refused([f"no guard is named {name}; there are: {known}"])
+        raise refusal([f"no guard is named {name}; there are: {known}"])
     found = appliance.ask_or_exit(admin.MonitorValuesWanted(name))
     if appliance.as_json:
         say_json({"guard": row, "values": found.values, "ages": found.ages, "age_seconds": found.age_seconds,

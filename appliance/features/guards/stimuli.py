@@ -117,7 +117,7 @@ class _Robot:
             yield self._said("command", _DRIVER, command)
 
     def _said(self, topic: str, node: str, fields: Fields | None) -> SyntheticMessage:
-        data = encoded(self._definitions, self.types[topic], fields or {})
+        data = encode_message(self._definitions, self.types[topic], fields or {})
         return SyntheticMessage(0.0, self.topics[topic], data, node)
 
     def number(self, name: str) -> float:
@@ -172,7 +172,7 @@ class _Robot:
         goal = {"goal_id": {"id": "test"}, "goal": {"trajectory": path}}
         return path if self.types["command"] == "trajectory_msgs/JointTrajectory" else goal
 
-    def held(self, *, held: bool) -> Fields:
+    def button_fields(self, *, held: bool) -> Fields:
         if self.types["by"] == "sensor_msgs/Joy":
             return {"buttons": [0] * round(self.number("button")) + [int(held)]}
         return {"data": held}
@@ -267,7 +267,7 @@ def _buttons(robot: _Robot) -> Readings:
 
 def _devices(robot: _Robot) -> Readings:
     for node in robot.several:
-        yield ("by", node), lambda number: robot.held(held=number > 2)
+        yield ("by", node), lambda number: robot.button_fields(held=number > 2)
 
 
 def _armed(robot: _Robot) -> Readings:
@@ -361,7 +361,7 @@ _FAULTS: Mapping[str, Callable[[_Robot], _Fault]] = {
     ),
     "estop": lambda robot: _from(f"a press on {robot.topics['stop']}", "stop", _FIRST, {"data": True}),
     "hold_to_run": lambda robot: _from(
-        f"the device on {robot.topics['by']} is let go", "by", _FIRST, robot.held(held=False)
+        f"the device on {robot.topics['by']} is let go", "by", _FIRST, robot.button_fields(held=False)
     ),
     "mode": lambda robot: _from(
         f"manual mode on {robot.topics['by']}, and a command of {robot.speed():g} m/s", "by", _FIRST, {"data": True}
@@ -402,7 +402,7 @@ def _distance(x: float, y: float, a: tuple[float, float], b: tuple[float, float]
     return math.hypot(x - a[0] - along * (b[0] - a[0]), y - a[1] - along * (b[1] - a[1]))
 
 
-def encoded(definitions: Definitions, kind: str, fields: Fields) -> bytes:
+def encode_message(definitions: Definitions, kind: str, fields: Fields) -> bytes:
     """Return a serialized message with these fields; all others are zero or empty.
 
     Raises `DefinitionError` for an unknown type.
@@ -432,4 +432,4 @@ def _value(definitions: Definitions, kind: str, value: Any) -> bytes:
         return struct.pack("<" + PRIMITIVES[kind][0], *(value or (0, 0)))
     if kind in PRIMITIVES:
         return struct.pack("<" + PRIMITIVES[kind][0], value or 0)
-    return encoded(definitions, kind, value or {})
+    return encode_message(definitions, kind, value or {})

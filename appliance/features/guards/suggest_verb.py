@@ -37,7 +37,7 @@ Scans = Sequence[tuple[int, bytes]]
 """Times in nanoseconds, with messages."""
 
 
-def permitted(preset: str, values: Mapping[str, str], scans: Scans) -> float | None:
+def permitted_velocity(preset: str, values: Mapping[str, str], scans: Scans) -> float | None:
     """Return the velocity straight ahead, in m/s, that a guard would let pass right after the last scan.
 
     None: the last of the scans is not a valid message.
@@ -170,9 +170,9 @@ def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Sc
 def _permits(one: Suggestion, scans: Scans) -> Iterator[tuple[str, float | None]]:
     """Yield what the guard would permit with its own values (no name), and with each of the less safe ones."""
     values = {**one.measured, **one.values}
-    yield "", permitted(one.preset, values, scans)
+    yield "", permitted_velocity(one.preset, values, scans)
     for name, value in WITHOUT[one.preset].items():
-        yield f"{name}={value}", permitted(one.preset, {**values, name: value}, scans)
+        yield f"{name}={value}", permitted_velocity(one.preset, {**values, name: value}, scans)
 
 
 def _sentence(topic: str, permits: dict[str, float | None]) -> str:

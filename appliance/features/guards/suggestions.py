@@ -93,7 +93,7 @@ def advice(
     others = (topic for topic in graph.topics if topic.type in {*types.TRAJECTORIES, *types.GOALS})
     for command in (*graph.velocities, *others):
         writer.left_out.extend(inside(graph, command))
-    unguarded = graph.unguarded({*types.COMMANDS, *types.GOALS})
+    unguarded = graph.unguarded_topics({*types.COMMANDS, *types.GOALS})
     if unguarded and graph.robots:
         named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:_MAX_NAMED])
         writer.left_out.append(f"no preset works with these commands, which may also move the robot: {named}")
@@ -140,7 +140,7 @@ class _Writer:
             for topic in graph.topics
             if _stops(f"{topic.name.rsplit('/', 1)[0]}/{graph.leaf(topic)}")
         }
-        self._common_stops = [topic for topic in graph.shared({BOOL}) if topic.name in self._stops]
+        self._common_stops = [topic for topic in graph.shared_topics({BOOL}) if topic.name in self._stops]
         self._alone = len([*graph.bases, *graph.arms, *graph.arm_velocities]) == 1
         self.found: list[Suggestion] = []
         self.in_use: list[LoadedSuggestion] = []

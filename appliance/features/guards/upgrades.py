@@ -19,7 +19,7 @@ from appliance.features.guards.presets import (
     values_in,
     works_with,
 )
-from appliance.features.guards.released import order_of, origin_of, released
+from appliance.features.guards.released import order_of, origin_of, released_preset
 from appliance.features.guards.robot_graph import MAX_TOPICS, VALUED, TopicFacts
 from rosmop.form.switch_words import Word
 
@@ -28,7 +28,7 @@ from rosmop.form.switch_words import Word
 _UNKNOWN = "*"  # the type of a topic that has only subscribers which do not know it
 
 
-def planned(  # noqa: PLR0917  one caller
+def plan(  # noqa: PLR0917  one caller
     preset: Preset,
     name: str,
     topics: Mapping[str, str],
@@ -106,7 +106,7 @@ class Upgrade:
     warnings: list[str]
 
 
-def upgraded(
+def upgrade_of(
     text: str,
     in_force: Mapping[str, str],
     graph: Iterable[TopicFacts],
@@ -129,7 +129,7 @@ def upgraded(
     preset = PRESETS[loaded.name]
     if origin == "current":
         raise GuardError(f"{name} has the present version of its preset: {preset.name} {preset.version}")
-    before = released(loaded.name, loaded.version)
+    before = released_preset(loaded.name, loaded.version)
     standard = values_in(before.text)
     values, changed, warnings = {}, {}, []
     known = {parameter.name: parameter for parameter in preset.parameters}
@@ -155,7 +155,7 @@ def upgraded(
         types = {each: kind for each, kind in types_in(text).items() if each not in topics}
         only = {each: kinds[0] for each, kinds in preset.topics.items() if len(kinds) == 1}
         types = only | {each: kind for each, kind in types.items() if each in preset.topics}
-        guard = planned(preset, name, {**topics_in(text), **topics}, graph, values, types)
+        guard = plan(preset, name, {**topics_in(text), **topics}, graph, values, types)
         guard = replace(guard, switch=switch)
     except GuardError as error:
         raise GuardError(f"{name}: {error}; or remove it, and make it again") from error
@@ -173,7 +173,7 @@ def _obstacle(parameter: Parameter | None, value: str) -> str:
     if parameter is None:
         return "has no such value"
     try:
-        parameter.checked(value)
+        parameter.check(value)
     except GuardError as error:
         return f"does not allow it: {error}"
     return ""

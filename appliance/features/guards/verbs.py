@@ -41,7 +41,7 @@ from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
     Preset,
-    described,
+    description_of,
     file_of,
     former_guard,
     is_former,
@@ -246,7 +246,7 @@ def set_values(
     loaded, row, text = _guard(appliance, name)
     preset = preset_of(text)
     assert preset is not None  # noqa: S101  `_guard` checks it
-    checked = {each: preset.parameter(each).checked(value) for each, value in wanted.items()}
+    checked = {each: preset.parameter(each).check(value) for each, value in wanted.items()}
     if dry_run:
         _plan(appliance, GuardTry(name=name, values=wanted, hold=hold))
         _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since or "1h")
@@ -258,7 +258,7 @@ def set_values(
     if in_text:
         changed = with_values(text, in_text)
         order = admin.MonitorReplace(
-            name, changed, note=described(changed), shadow=row.shadow, hold=hold, given=constants
+            name, changed, note=description_of(changed), shadow=row.shadow, hold=hold, given=constants
         )
         _say_changed(appliance, appliance.ask_or_exit(order))
         write_specification(appliance, loaded, row, changed)

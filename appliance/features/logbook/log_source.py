@@ -16,7 +16,7 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog, RestSnapshot
 from appliance.cli.output import usage_error
 from appliance.formats.interventions import Intervention
-from appliance.formats.machine_report import NamedEntry, merged
+from appliance.formats.machine_report import NamedEntry, merge
 
 _ORIGIN_SECONDS = 60
 _ORIGIN_RECORDS = 50
@@ -72,7 +72,7 @@ class OpenedLogs(ExitStack):
             self.callback(snapshot.close)
 
     def of_events(self, events: Collection[str]) -> Iterator[NamedEntry]:
-        return merged({name: log.of_events(events) for name, log in self._logs.items()})
+        return merge({name: log.of_events(events) for name, log in self._logs.items()})
 
     def with_origin(self, row: Intervention) -> Intervention:
         """Return the row with the address of its REST call, if the log leaves no doubt."""

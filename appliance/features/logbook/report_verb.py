@@ -250,7 +250,7 @@ class _Live(msgspec.Struct):
         for answer in (status, policy, tokens):
             if not answer.ok:
                 return cls(reason=f"not known: {answer.error}")
-        state, text, made = msgspec.to_builtins(status.given()), policy.given(), tokens.given()
+        state, text, made = msgspec.to_builtins(status.unwrap()), policy.unwrap(), tokens.unwrap()
         known = PolicyContext(
             {name: address_of(address) for name, address in text.hosts.items()},
             [ipaddress.ip_network(place) for place in text.robot],
@@ -259,7 +259,7 @@ class _Live(msgspec.Struct):
             ends=ends_of(text.ended, text.lasting),
         )
         try:
-            compiled = known.compiled(text.text, text.file)
+            compiled = known.compile(text.text, text.file)
         except PolicyError as error:
             return cls(
                 reason=f"not known: this program's version does not read the policy in force: {error.findings[0]}"

@@ -40,7 +40,7 @@ def routes(services: Services) -> Routes:
         """Return the metrics in Prometheus's text format; docs/reference/metrics.md lists them."""
         calls = services.journal.calls
         try:
-            page = rendered(await ask(services.control, MetricsWanted(), bearer), calls)
+            page = render(await ask(services.control, MetricsWanted(), bearer), calls)
         except ProblemError as problem:
             if problem.kind != "standby":
                 raise
@@ -59,7 +59,7 @@ def routes(services: Services) -> Routes:
     return router
 
 
-def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
+def render(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
     return page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
 
 

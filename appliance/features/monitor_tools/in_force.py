@@ -17,7 +17,7 @@ from appliance.cli.monitor_changes import Hold, say_held, say_replaced, say_shad
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from rosmop.tool.tables import say_table, table_of
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 _Names = Annotated[
     list[str],
@@ -254,7 +254,7 @@ def set_given(
         if not found:
             names = ", ".join(row.name for row in rows)
             known = f"there are: {names}" if names else "none is loaded"
-            raise refused([f"rosrv monitor set: no monitor is named {name}; {known}"])
+            raise refusal([f"rosrv monitor set: no monitor is named {name}; {known}"])
         given = found[0].given
     if appliance.as_json:
         for one in given:
@@ -274,7 +274,7 @@ def _shown(value: GivenValue) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _assigned(text: str, form: str) -> tuple[str, str]:
+def _parse_assignment(text: str, form: str) -> tuple[str, str]:
     name, sign, value = text.partition("=")
     if not sign or not name or not value:
         raise usage_error(f"{printable(text)}: write {form}", "rosrv monitor")
@@ -284,7 +284,7 @@ def _assigned(text: str, form: str) -> tuple[str, str]:
 def _all_assigned(texts: list[str], form: str) -> dict[str, GivenValue]:
     found: dict[str, GivenValue] = {}
     for text in texts:
-        name, value = _assigned(text, form)
+        name, value = _parse_assignment(text, form)
         if name in found:
             raise usage_error(f"{printable(name)} has two values: give one", "rosrv monitor")
         found[name] = value

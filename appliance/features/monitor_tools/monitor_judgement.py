@@ -86,10 +86,10 @@ class Compiler:
 
     def _set(self, loaded: Monitors) -> MonitorSet:
         if self._last is None or self._last[0] != loaded.revision:
-            self._last = (loaded.revision, _compiled(loaded))
+            self._last = (loaded.revision, _compile(loaded))
         return self._last[1]
 
-    def described(self, loaded: Monitors, name: str) -> Described:
+    def describe(self, loaded: Monitors, name: str) -> Described:
         """Return the description of a monitor. Raises `KeyError`."""
         monitor = self._set(loaded).monitor(name)
         events = [
@@ -121,6 +121,6 @@ class Compiler:
         return svg_of([code.property for code in monitor.code.properties])
 
 
-def _compiled(loaded: Monitors) -> MonitorSet:
-    known = standard_definitions().extended(Definitions.from_files(loaded.definitions or {}))
+def _compile(loaded: Monitors) -> MonitorSet:
+    known = standard_definitions().merge(Definitions.from_files(loaded.definitions or {}))
     return MonitorSet.of(compiled_from(loaded.files or {}, known, topics=loaded.topics or {}))

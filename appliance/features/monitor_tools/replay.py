@@ -17,7 +17,7 @@ from rosmop.tool.options import Bags, BagSets, Folders, On, ReportFile, Resume, 
 from rosmop.tool.replay_report import ReplayReport
 from rosmop.tool.run_command import run_batch, run_spans
 from rosmop.tool.specification_input import Specifications, read_for_recordings, topics_of
-from rosmop.tool.terminal import refused
+from rosmop.tool.terminal import refusal
 
 _MonitorOrFile = Annotated[
     str,
@@ -103,7 +103,7 @@ def replay_monitor(
         if status:
             raise typer.Exit(status)
     except SpecificationError as error:
-        raise refused(error.findings) from None
+        raise refusal(error.findings) from None
 
 
 def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) -> Specifications:

@@ -13,7 +13,7 @@ from appliance.specifications.specification_revisions import forget_revision
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.supervisor.state_directory import StateDirectory
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 _STATE, _VERB = "state.db", "rosrv monitor"
 
@@ -62,7 +62,7 @@ def _forget(home: Path) -> int | None:
             raise StoreError(troubles[-1])
         return revision
     except StoreError as error:
-        raise refused([f"{_VERB}: cannot change the state: {error}"]) from error
+        raise refusal([f"{_VERB}: cannot change the state: {error}"]) from error
     finally:
         if os.geteuid() == 0:
             for path in home.glob("state.*"):

@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 from appliance.api.front.access import Bearer
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask, reads_contents
-from appliance.api.front.routing import Responses, Routes, Tagged, file, tagged
+from appliance.api.front.routing import Responses, Routes, Tagged, file, with_tag
 from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import LogReader
 from appliance.api.routes.operation_routes import Answer, AnsweringRoutes, OperationCall
@@ -53,9 +53,9 @@ class _Looking:
             raise unknown_monitor(name, loaded)
         return loaded, row
 
-    async def described(self, bearer: Bearer, loaded: Monitors, name: str) -> Described:
+    async def describe(self, bearer: Bearer, loaded: Monitors, name: str) -> Described:
         async with self._services.judging.turn(bearer):
-            return await asyncio.to_thread(self.compiler.described, loaded, name)
+            return await asyncio.to_thread(self.compiler.describe, loaded, name)
 
     async def picture(self, bearer: Bearer, loaded: Monitors, name: str) -> str | None:
         async with self._services.judging.turn(bearer):
@@ -76,7 +76,7 @@ def routes(services: Services) -> Routes:
     async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
         """One monitor: state, counters, the text of its file, its events and properties."""
         loaded, state = await looking.state(bearer, name)
-        found = await looking.described(bearer, loaded, name)
+        found = await looking.describe(bearer, loaded, name)
         shown = Monitor(
             **asdict(state),
             revision=loaded.revision,
@@ -88,7 +88,7 @@ def routes(services: Services) -> Routes:
             uses=found.uses,
             hold=found.hold,
         )
-        return tagged(shown)
+        return with_tag(shown)
 
     @router.get("/{name}/picture", responses=_PICTURE | UNKNOWN, response_class=Response)
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
@@ -155,7 +155,7 @@ def _happened(entry: LogEntry) -> Happened:
 
 
 async def _load(call: OperationCall[admin.MonitorLoad | admin.MonitorReplace]) -> Tagged[Replaced]:
-    return tagged(await call.ask(admin.MonitorTry(call.order) if call.dry_run else call.order))
+    return with_tag(await call.ask(admin.MonitorTry(call.order) if call.dry_run else call.order))
 
 
 _ANSWERS = {"load_monitors": Answer(_load), "replace_monitor": Answer(_load)}

@@ -25,7 +25,7 @@ class EnforcedText(NamedTuple):
     sections: tuple[str, ...]
 
 
-def enforced(text: str, sections: Collection[str] = ()) -> EnforcedText:
+def enforced_text(text: str, sections: Collection[str] = ()) -> EnforcedText:
     """Return the text that enforces these sections, or all. Raises `EnforceError`.
 
     The line `audit-only` keeps the other sections and its comment, or is removed.

@@ -80,7 +80,7 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
     parameter = request.category in PARAMETERS
     decision = decide_right(policy, right)
     atoms = policy.atoms_of(request.host)
-    blocked = policy.blocked(request.host) is not None
+    blocked = policy.block_of(request.host) is not None
     matching = [] if blocked else _matching(policy, request)
     winner = next((rule for rule in matching if rule.rule == decision.rule), None)
     through = winner.granted_through(atoms) if winner is not None else ()
@@ -134,7 +134,7 @@ def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
 
 
 def _carried(policy: Policy, request: Request) -> str:
-    group = policy.commanded(request.resource) if request.category is Category.PUBLISH else None
+    group = policy.command_group(request.resource) if request.category is Category.PUBLISH else None
     if group is None:
         return ""
     if group.ranks:

@@ -33,7 +33,7 @@ from appliance.policy.model import Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import Right
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 _MAX_CALLERS = 4  # names in one line
 
@@ -79,7 +79,7 @@ def compare(
     before, after = _sources(appliance, old, new)
     if decisions or requests is not None:
         known = _known(appliance, old, new, robot, enrolled)
-        policies = _compiled(before, known), _compiled(after, known)
+        policies = _compile(before, known), _compile(after, known)
         differ = _say_decisions(appliance, *policies, requests)
     elif robot or enrolled:
         raise usage_error("--robot and --enrolled need --decisions")
@@ -137,11 +137,11 @@ def _known(
     )
 
 
-def _compiled(source: _Source, known: PolicyContext) -> Policy:
+def _compile(source: _Source, known: PolicyContext) -> Policy:
     try:
-        return known.compiled(source.text, source.name)
+        return known.compile(source.text, source.name)
     except PolicyError as error:
-        raise refused(error.findings) from error
+        raise refusal(error.findings) from error
 
 
 def _say_decisions(appliance: Appliance, old: Policy, new: Policy, requests: Path | None) -> bool:

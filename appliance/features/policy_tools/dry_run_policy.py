@@ -25,9 +25,9 @@ from appliance.policy.policy_findings import PolicyError
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
     """Return the effects of a change. Raises `ProblemError` with every finding if the text is rejected."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
-    before = known.compiled(current.text, current.file)
+    before = known.compile(current.text, current.file)
     try:
-        policy = judge(order.text, "policy", known, order.signature).accepted()
+        policy = judge(order.text, "policy", known, order.signature).accept()
     except PolicyError as error:
         raise refused_text(error) from error
     live = [LiveRight.of(msgspec.structs.asdict(row)) for row in registrations]

@@ -20,7 +20,7 @@ from appliance.features.policy_tools.audit_only import (
     EnforcedAlreadyError,
     EnforcedText,
     EnforceError,
-    enforced,
+    enforced_text,
 )
 from appliance.features.policy_tools.learn import Observation, needed_rights
 from appliance.features.policy_tools.live_verbs import say_loaded
@@ -39,7 +39,7 @@ from appliance.policy.model import Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import Right, decide_right
 from appliance.policy.sections import PARAMETERS
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 _MAX_SHOWN = 20
 
@@ -106,7 +106,7 @@ def enforce(
         refuse_beside_dry_run("rosrv policy", confirm_within=confirmed, when_standing=when_standing)
     body = body_in_force(appliance)
     try:
-        change = enforced(body.text, sections or ())
+        change = enforced_text(body.text, sections or ())
     except EnforcedAlreadyError as error:
         if appliance.as_json:
             say_json({"sections": [], "revision": body.revision, "replaced": body.revision})
@@ -114,7 +114,7 @@ def enforce(
             say(f"no change: {error}")
         return
     except EnforceError as error:
-        raise refused([f"rosrv policy: {error}"]) from None
+        raise refusal([f"rosrv policy: {error}"]) from None
     policy = compiled_with(change.text, body.file, context_of(body))
     period = recorded_period(appliance, since)
     live = live_now(appliance)
@@ -203,7 +203,7 @@ def _load(
         target = str(written) if written is not None else "FILE"
         steps = f"sign it (rosrv sign {target} --key KEY), put it at {known.policy_file}, and run: rosrv policy reload"
         first = "" if written is not None else "write the changed policy with --output FILE, "
-        raise refused([f"rosrv policy: this appliance loads signed policies only: {first}{steps}"])
+        raise refusal([f"rosrv policy: this appliance loads signed policies only: {first}{steps}"])
     body = appliance.ask_or_exit(PolicyLoad(change.text, f"enforces {names}", within, known.revision))
     if appliance.as_json:
         say_json(body)

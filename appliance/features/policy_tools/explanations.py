@@ -56,7 +56,7 @@ def asked_of(record: AuditRecord) -> DecidedRequest:
         raise UngrantableError(NO_DECISION)
     if isinstance(what, str):
         raise UngrantableError(f"no change of the policy would allow it: {what}")
-    if record.rule is None and record.reason.startswith(f"{record.host} is blocked by "):  # `Policy.blocked`
+    if record.rule is None and record.reason.startswith(f"{record.host} is blocked by "):  # `Policy.block_of`
         raise UngrantableError(
             "an operator's block denied it, not the policy; if the block is still in force (rosrv host blocks),"
             f" lift it: rosrv host unblock {record.host}"
@@ -262,7 +262,7 @@ _GRANTED = (
 )
 
 
-def granted(
+def grant_of(
     record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False, until: str = ""
 ) -> Granted:
     """Return the change that would allow a denied request, or raise `UngrantableError`.
@@ -302,7 +302,7 @@ def explained(
     found, refusal = None, ""
     try:
         if current is not None:
-            found = granted(record, current)
+            found = grant_of(record, current)
             refusal = "" if found.added else _GRANTED
         elif is_denial(record):
             asked_of(record)

@@ -64,7 +64,7 @@ class GrantedText:
     def findings(self, file: str, known: PolicyContext) -> list[str]:
         try:
             unsigned = replace(known, site_keys=())  # the new text cannot be signed yet
-            judge(self.text, file, unsigned).accepted()
+            judge(self.text, file, unsigned).accept()
         except PolicyError as error:
             return [str(finding) for finding in error.findings]
         return []
@@ -79,25 +79,25 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest, unt
 
     Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
     """
-    policy = known.compiled(text, file)
+    policy = known.compile(text, file)
     word = _word(text, known, policy, asked.request.host)
     if until:
         word = f"{word} {UNTIL} {_date(until, known, policy)}"
-    block = replace(policy, blocks=known.blocks).blocked(asked.request.host)
+    block = replace(policy, blocks=known.blocks).block_of(asked.request.host)
     if block is not None:
         raise UngrantableError(f"no line of a policy grants it: {block.reason}")
     added: list[str] = []
     most = _MAX_LINES + len(asked.rights)
     while (
-        missing := next((right for right in asked.rights if not _granted(policy, right)), None)
+        missing := next((right for right in asked.rights if not _is_granted(policy, right)), None)
     ) is not None:
         reason = decide_right(policy, missing).reason
         if len(added) == most:
             raise UngrantableError(f"more than {most} lines would have to change: {reason}")
-        text, line = _changed(policy, text, missing, word, "" if added else asked.wide)
+        text, line = _change(policy, text, missing, word, "" if added else asked.wide)
         added.append(line)
         try:
-            policy = known.compiled(text, file)
+            policy = known.compile(text, file)
         except PolicyError:  # the line is invalid: the call is unknown, or no key can name the resource
             raise UngrantableError(f"no line of a policy grants it: {reason}") from None
     if asked.takeover and policy.takeover != TAKEOVERS[-1]:
@@ -106,7 +106,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest, unt
     return GrantedText(text, tuple(added))
 
 
-def _granted(policy: Policy, right: Right) -> bool:
+def _is_granted(policy: Policy, right: Right) -> bool:
     if right.request.category in PARAMETERS and right.request.category not in policy.present:
         return True
     decision = decide_right(policy, right)
@@ -146,7 +146,7 @@ def _sections(text: str) -> list[SectionText]:
     return read(text, Findings(""))
 
 
-def _changed(policy: Policy, text: str, right: Right, word: str, wide: str = "") -> tuple[str, str]:
+def _change(policy: Policy, text: str, right: Right, word: str, wide: str = "") -> tuple[str, str]:
     request = right.request
     rule, key = decide_right(policy, right).rule, wide or _key(request)
     name = BY_CATEGORY[request.category].name
@@ -157,7 +157,7 @@ def _changed(policy: Policy, text: str, right: Right, word: str, wide: str = "")
         if section is not None and word in _holders(section, f"{request.category} {key}"):
             # A pattern that also matches other names (/*/max) denies the request until all keys below have a rule.
             table = policy.tables[request.category]
-            above = table.tree.inherited(request.resource) or table.default
+            above = table.tree.inherited_value(request.resource) or table.default
             rule, key = above.rule if above is not None else None, _below(request.resource, None)
         if key == _below(request.resource, None) and itself.rule not in (None, rule):
             # The new key /arm/** also matches /arm. A key /arm of its own keeps the hosts of /arm.

@@ -25,7 +25,7 @@ from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
 from appliance.cli.output import say_json, usage_error, write_told
-from appliance.features.policy_tools.explanations import asks_policy, explained, granted
+from appliance.features.policy_tools.explanations import asks_policy, explained, grant_of
 from appliance.features.policy_tools.grant import UngrantableError
 from appliance.features.policy_tools.live_verbs import say_loaded
 from appliance.policy.hours import instant
@@ -60,7 +60,7 @@ def _explain(appliance: Appliance, record: str) -> Why:
         entry = _entry(appliance, record)
         found = entry.record
         try:
-            known = appliance.ask(PolicyWanted()).given() if asks_policy(found) else None
+            known = appliance.ask(PolicyWanted()).unwrap() if asks_policy(found) else None
         except NotRunningError as error:
             typer.echo(
                 f"rosrv audit: {error}; without it, the rule that would allow the request is unknown",
@@ -111,7 +111,7 @@ def grant(
     within = seconds_within(confirm_within, "policy")
     if within is not None and not load:
         raise usage_error("--confirm-within needs --load")
-    found = _granted(appliance, record, tool=tool, until=_end(until, for_time))
+    found = _grant(appliance, record, tool=tool, until=_end(until, for_time))
     if appliance.as_json:
         say_json(found)
     else:
@@ -171,7 +171,7 @@ def _show(found: Granted, record: str) -> None:
         say(f"other verbs of {found.tool} need up to {more}: {all_of_it}", "yellow")
 
 
-def _granted(appliance: Appliance, record: str, *, tool: bool, until: str) -> Granted:
+def _grant(appliance: Appliance, record: str, *, tool: bool, until: str) -> Granted:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool, until=until), Granted)
 
@@ -179,7 +179,7 @@ def _granted(appliance: Appliance, record: str, *, tool: bool, until: str) -> Gr
         found = _entry(appliance, record).record
         known = appliance.ask_or_exit(PolicyWanted())
         try:
-            return granted(found, known, whole_tool=tool, until=until)
+            return grant_of(found, known, whole_tool=tool, until=until)
         except UngrantableError as error:
             fail(str(error), 1)
 

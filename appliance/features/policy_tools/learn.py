@@ -29,7 +29,7 @@ from appliance.policy.ini_reader import is_key
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import COMMAND_FOR, rights_of_call
 from appliance.policy.sections import ASK, ASKING, DECIDERS, PARAMETERS
-from roswire.names import is_global_name, searched
+from roswire.names import candidate_keys, is_global_name
 
 ROBOT = "robot"
 """The group of the appliance's own machine."""
@@ -181,7 +181,7 @@ def _join_log_levels(rights: _Rights) -> None:
             rights[category, joined] = merged
 
 
-def covered(given: Network, places: Iterable[Network]) -> bool:
+def is_covered(given: Network, places: Iterable[Network]) -> bool:
     return any(
         given.version == place.version and given.subnet_of(place)  # type: ignore[arg-type]  # both are of one version
         for place in places
@@ -195,7 +195,7 @@ def needed_rights(observation: Observation) -> Iterator[Request]:
         yield right.request
     if observation.call == "searchParam":
         request = observation.request
-        for name in searched(observation.key, request.caller_id):
+        for name in candidate_keys(observation.key, request.caller_id):
             check_resource(Category.READ, name)
             yield Request(request.host, request.caller_id, Category.READ, name)
 

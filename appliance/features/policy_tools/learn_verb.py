@@ -19,12 +19,12 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, write_told
 from appliance.cli.output import usage_error as usage
-from appliance.features.policy_tools.audit_only import EnforceError, enforced
+from appliance.features.policy_tools.audit_only import EnforceError, enforced_text
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, grant
 from appliance.features.policy_tools.learn import (
     ROBOT,
     LearnedPolicy,
-    covered,
+    is_covered,
     lasting_name,
     learn,
     needed_rights,
@@ -53,7 +53,7 @@ from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import Right, decide_right
 from appliance.policy.rules import MAXIMUM_INNER_STARS
 from appliance.policy.sections import PARAMETERS
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 from roswire.names import is_global_name
 
 # Extend a policy by questions to a person: one for each kind of right that recorded requests needed and it denies.
@@ -98,10 +98,10 @@ class AskedPolicy:
 
     def __post_init__(self) -> None:
         if self.cases:
-            results = run_cases(self._compiled(), self.cases_text, f"{self.file}.tests.yaml")
+            results = run_cases(self._compile(), self.cases_text, f"{self.file}.tests.yaml")
             denied = (result.request for result in results if result.expected == "deny")
             self._denied |= {(request.category, request.resource, request.host) for request in denied}
-        members = [str(place.network_address) for place in self._compiled().robot]
+        members = [str(place.network_address) for place in self._compile().robot]
         if members:
             self.given.setdefault("robot", members)
 
@@ -110,8 +110,8 @@ class AskedPolicy:
         given = {"given": self.given} if self.given else {}
         return yaml.safe_dump({**given, "cases": self.cases}, sort_keys=False)
 
-    def _compiled(self) -> Policy:
-        return self.known.compiled(self.text, self.file)
+    def _compile(self) -> Policy:
+        return self.known.compile(self.text, self.file)
 
     def missing(self, counts: Counter[tuple[RightKind, str]]) -> Iterator[tuple[RightKind, str, int]]:
         """Yield the kinds that the rules deny and no test case denies, with a node and the number of requests.
@@ -132,19 +132,19 @@ class AskedPolicy:
         name = name_for(kind.name)
         if (kind.category, name, kind.host) in self._denied:
             return False
-        policy = self._enforced()
+        policy = self._enforce()
         if kind.category in PARAMETERS and kind.category not in policy.present:
             return False
         decision = decide_right(policy, Right(Request(kind.host, "", kind.category, name)))
         return not decision.allowed and decision.asks is None
 
-    def _enforced(self) -> Policy:
+    def _enforce(self) -> Policy:
         if self._policy is None or self._policy[0] != self.text:
             try:
-                text = enforced(self.text).text
+                text = enforced_text(self.text).text
             except EnforceError:  # it is enforced already
                 text = self.text
-            policy = self.known.compiled(text, self.file)
+            policy = self.known.compile(text, self.file)
             self._policy = self.text, policy
         return self._policy[1]
 
@@ -159,20 +159,20 @@ class AskedPolicy:
     def deny(self, kind: RightKind, node: str) -> None:
         """Add a test case that no later change may allow it."""
         host = str(kind.host)
-        if any(kind.host in place for place in self._compiled().robot):
+        if any(kind.host in place for place in self._compile().robot):
             host = ROBOT
         named = node if is_global_name(node) else "/visitor"  # a tool has a name such as /rosparam-4711
         case = {"host": host, "node": named, "deny": [kind.action]}
         self.cases.append(case)
         self._denied.add((kind.category, name_for(kind.name), kind.host))
 
-    def judged(self) -> None:
+    def judge(self) -> None:
         """Raise `PolicyError` if the text or one of its cases is wrong."""
         cases = self.cases_text if self.cases else None
         known = replace(
             self.known, cases_file=f"{self.file}.tests.yaml", cases=cases, cases_error=None, site_keys=()
         )
-        judge(self.text, self.file, known).accepted()
+        judge(self.text, self.file, known).accept()
 
 
 def kinds_of(period: RecordedPeriod) -> Counter[tuple[RightKind, str]]:
@@ -204,9 +204,9 @@ def ask_rights(appliance: Appliance, period: RecordedPeriod, output: Path) -> in
         cases = yaml.load(tests, yaml.BaseLoader) or {}  # noqa: S506  it only makes texts: a time stays as it is written
         asked = AskedPolicy(text, str(output), known, cases.get("given") or {}, cases.get("cases") or [])
     except PolicyError as error:
-        raise refused(error.findings) from error
+        raise refusal(error.findings) from error
     except (yaml.YAMLError, AttributeError) as error:
-        raise refused([f"{beside}: not a file of test cases: {error}"]) from error
+        raise refusal([f"{beside}: not a file of test cases: {error}"]) from error
 
     def keep() -> None:
         write_told(output, asked.text.encode())
@@ -228,9 +228,9 @@ def ask_rights(appliance: Appliance, period: RecordedPeriod, output: Path) -> in
         say(note, "yellow")
     answers = carry_out(asked, kinds, answer, keep)
     try:
-        asked.judged()
+        asked.judge()
     except PolicyError as error:
-        raise refused(
+        raise refusal(
             [*error.findings, f"rosrv policy: {output} is written, and does not pass its checks (see above)"]
         ) from error
     allowed, later = answers["allow"] + answers["wider"], counted(answers["later"], "question")
@@ -334,9 +334,9 @@ def learn_policy(
     if not learned.requests:
         start = " of these hosts" * bool(host) + (f" since {since}" if since is not None else "")
         hint = "run the robot with `audit-only = all` below [Options] first"
-        raise refused([f"rosrv: the audit log has no allowed requests{start}: {hint}"])
+        raise refusal([f"rosrv: the audit log has no allowed requests{start}: {hint}"])
     if learned.unstarted and not with_start:
-        raise refused([_not_started(learned)])
+        raise refusal([_not_started(learned)])
     _check(learned, members, tests_wanted=tests is not None or appliance.as_json)
     for file, text in ((output, learned.text), (tests, learned.tests)):
         if file is not None:
@@ -377,7 +377,7 @@ def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:
         own = running_robot(appliance)
     except NotRunningError:
         return robot
-    members = [given for given in robot if covered(given, own)]
+    members = [given for given in robot if is_covered(given, own)]
     group = ", ".join(map(_shown, own)) or "empty"
     for other in robot:
         if other not in members:
@@ -397,10 +397,10 @@ def _check(learned: LearnedPolicy, robot: list[Network], *, tests_wanted: bool) 
         results = run_cases(policy, learned.tests, "learned.tests.yaml") if testable else []
     except PolicyError as error:
         what = f"rosrv: the learned policy is invalid (see above): {_busiest(learned)}"
-        raise refused([*error.findings, what]) from error
+        raise refusal([*error.findings, what]) from error
     failed = [result for result in results if not result.passed]
     if failed:
-        raise refused([*failed, "rosrv: the learned policy does not grant what was used (see above)"])
+        raise refusal([*failed, "rosrv: the learned policy does not grant what was used (see above)"])
 
 
 def _busiest(learned: LearnedPolicy) -> str:

@@ -35,13 +35,13 @@ def impact_of(
 ) -> PolicyImpact:
     if appliance.place is not None:
         return _by_dry_run(appliance, file)
-    known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).given())))
+    known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).unwrap())))
     try:
-        policy = judge(read_text(file), str(file), known, read_signature(file)).accepted()
+        policy = judge(read_text(file), str(file), known, read_signature(file)).accept()
         beside = cases_beside(file)
         if is_named_there(beside) and str(beside.absolute()) != known.cases_file:
             own = replace(known, cases_file=str(beside), cases=read_text(beside), site_keys=())
-            judge(policy.text, str(file), own).accepted()
+            judge(policy.text, str(file), own).accept()
     except PolicyError as error:
         return PolicyImpact(error.findings, [])
     return PolicyImpact(list(policy.warnings), endings(policy, live_now(appliance)))

@@ -29,7 +29,7 @@ from appliance.cli.connection.admin_client import NotRunningError, RestProblemEr
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import time_given
-from appliance.features.policy_tools.learn import Observation, covered, needed_rights
+from appliance.features.policy_tools.learn import Observation, is_covered, needed_rights
 from appliance.policy import sections
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
@@ -75,7 +75,7 @@ class RecordedPeriod:
             passed = Filter(decision=("allow", "would deny"), event=event, since=self.since)
             for entry in self.read(passed):
                 host = entry.record.host
-                if not self.hosts or host is None or covered(_network_of(host), self.hosts):
+                if not self.hosts or host is None or is_covered(_network_of(host), self.hosts):
                     yield from self._of(entry.record)
 
     def notes(self, appliance: Appliance, what: str) -> Iterator[str]:
@@ -156,7 +156,7 @@ def known_of(
     robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
 ) -> PolicyContext:
     known = running or PolicyContext(now=clock.wall())
-    hosts = dict(_enrolled(text) for text in enrolled or ())
+    hosts = dict(_parse_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
@@ -167,7 +167,7 @@ def networks_of(given: list[str] | None, option: str = "--robot") -> list[Networ
         raise usage_error(f"{option}: {error}; write 192.168.1.20 or 192.168.1.0/24") from error
 
 
-def _enrolled(text: str) -> tuple[str, Address]:
+def _parse_enrolled(text: str) -> tuple[str, Address]:
     name, _, address = text.partition("=")
     try:
         return name, canonical_address(ipaddress.ip_address(address))
@@ -200,7 +200,7 @@ def context_of(body: PolicyInForce) -> PolicyContext:
 
 
 def running_robot(appliance: Appliance) -> list[Network]:
-    body = appliance.ask(PolicyWanted()).given() if appliance.place is None else _over_rest(appliance)
+    body = appliance.ask(PolicyWanted()).unwrap() if appliance.place is None else _over_rest(appliance)
     return [canonical_network(ipaddress.ip_network(place)) for place in (*body.robot, *body.own)]
 
 

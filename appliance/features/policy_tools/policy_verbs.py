@@ -42,7 +42,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.policy.rights import needs_node, rights_of
 from appliance.policy.sections import DECIDERS
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 # List the rights of one host: the rules that grant it something. No I/O.
 
@@ -155,7 +155,7 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
             "red" if errors else "green",
         )
     if not errors:
-        _say_times(known_of(robot, enrolled).compiled(read_text(file), str(file)), as_json=appliance.as_json)
+        _say_times(known_of(robot, enrolled).compile(read_text(file), str(file)), as_json=appliance.as_json)
     _say_endings(impact.ends, appliance)
     raise typer.Exit(1 if errors else 0)
 
@@ -215,7 +215,7 @@ def _impact(
         except NotRunningError as error:
             typer.echo(f"rosrv policy: {error}; checked without it", err=True)
     try:
-        return PolicyImpact(list(_judge(file, robot, enrolled, cases_beside(file)).accepted().warnings), [])
+        return PolicyImpact(list(_judge(file, robot, enrolled, cases_beside(file)).accept().warnings), [])
     except PolicyError as error:
         return PolicyImpact(error.findings, [])
 
@@ -230,7 +230,7 @@ def _allowing(policy: Policy, request: Request) -> Iterator[str]:
     yield from (f"would be allowed by: {line}" for line in found.added)
 
 
-def compiled(
+def compile_or_exit(
     appliance: Appliance, file: Path | None, robot: list[str] | None, enrolled: list[str] | None
 ) -> Policy:
     if file is not None:
@@ -240,9 +240,9 @@ def compiled(
 
 def compiled_with(text: str, name: str, known: PolicyContext) -> Policy:
     try:
-        policy = known.compiled(text, name)
+        policy = known.compile(text, name)
     except PolicyError as error:  # the appliance has another version
-        raise refused(error.findings) from error
+        raise refusal(error.findings) from error
     return known.complete(policy)
 
 
@@ -295,7 +295,7 @@ def explain_request(
     chosen = [(category, name) for category, name in asked.items() if name is not None]
     if len(chosen) > 1 or (node and not chosen):
         raise usage_error("give exactly one action of the host: --publish TOPIC, --command CALL, …")
-    policy = compiled(appliance, file, robot, enrolled)
+    policy = compile_or_exit(appliance, file, robot, enrolled)
     if not chosen:
         raise typer.Exit(_list_rights(appliance, policy, host, "in force" if file is None else str(file)))
     category, name = chosen[0]
@@ -335,7 +335,7 @@ def show_host(
 
     Example: rosrv host show door:alice
     """
-    policy = compiled(appliance, None, None, None)
+    policy = compile_or_exit(appliance, None, None, None)
     host = _known_as(name, policy)
     status = _list_rights(appliance, policy, host, "in force")
     address = asking_host(host, policy)
@@ -459,4 +459,4 @@ def _judge_or_exit(
     try:
         return _judge(file, robot, enrolled, cases)
     except PolicyError as error:
-        raise refused(error.findings) from error
+        raise refusal(error.findings) from error

@@ -11,10 +11,10 @@ import msgspec
 from fastapi import Query
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.moments import given
+from appliance.api.front.moments import parse_moment
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask, ask_optional
-from appliance.api.front.routing import Responses, Routes, Tagged, body, tagged
+from appliance.api.front.routing import Responses, Routes, Tagged, body, with_tag
 from appliance.api.front.services import Services
 from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord, readable_by
 from appliance.api.routes.named_hosts import HostLabels, host_in_words, labels_of
@@ -31,7 +31,7 @@ from appliance.features.policy_tools.explanations import (
     asks_policy,
     explained,
     explanation,
-    granted,
+    grant_of,
     judge_text,
 )
 from appliance.features.policy_tools.grant import UngrantableError
@@ -65,7 +65,7 @@ def _of_texts(services: Services) -> Routes:
     async def policy(bearer: Viewer) -> Tagged[PolicyInForce]:
         """Return the policy in force, with its ETag."""
         known = await ask(control, PolicyWanted(), bearer)
-        return tagged(msgspec.convert(known, PolicyInForce, from_attributes=True))
+        return with_tag(msgspec.convert(known, PolicyInForce, from_attributes=True))
 
     @router.get("/hosts")
     async def host_names(bearer: Viewer) -> HostLabels:
@@ -97,9 +97,9 @@ async def _load(call: OperationCall[PolicyLoad]) -> Tagged[Report]:
         report = Report(loaded=False, revision=0, warnings=[], changes=[], ends=[])
     else:
         if call.dry_run:
-            return tagged(report)
+            return with_tag(report)
         loaded = await call.ask(order)
-    return tagged(
+    return with_tag(
         msgspec.structs.replace(
             report,
             loaded=True,
@@ -122,7 +122,7 @@ def policy_uses(
 ) -> PolicyUses:
     """Return the uses since a time (nanoseconds since the epoch). Raises `LogUnreadableError`."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
-    policy = known.complete(known.compiled(current.text, current.file))
+    policy = known.complete(known.compile(current.text, current.file))
     records = _NewestRecords(path, most)
     period: RecordedPeriod = replace(period_since(partial(export, path), since, since), read=records)
     uses = RuleUses(policy)
@@ -180,7 +180,7 @@ def _of_policy(services: Services) -> Routes:
     router = Routes(prefix="/policy", tags=["policy"])
     control, desk = services.control, LogReader(services)
 
-    async def explained(question: Question, bearer: Bearer) -> Explained:
+    async def explain(question: Question, bearer: Bearer) -> Explained:
         current = await ask(control, PolicyWanted(), bearer)
         async with services.judging.turn(bearer):
             asked = msgspec.structs.asdict(question)
@@ -202,12 +202,12 @@ def _of_policy(services: Services) -> Routes:
         ] = "",
     ) -> Explained:
         """Why the policy in force decides a request as it does."""
-        return await explained(Question(host=host, node=node, category=category, resource=resource), bearer)
+        return await explain(Question(host=host, node=node, category=category, resource=resource), bearer)
 
     @router.post("/explain")
     async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
         """Explain the decision of a request under another text, which is not loaded."""
-        return await explained(question, bearer)
+        return await explain(question, bearer)
 
     @router.get("/uses", operation_id="policy_uses")
     async def uses(
@@ -217,7 +217,7 @@ def _of_policy(services: Services) -> Routes:
         ] = "30d",
     ) -> PolicyUses:
         """Return the rules of the policy in force that recorded requests used, as `rosrv policy unused` does."""
-        moment = given(since)
+        moment = parse_moment(since)
         current = await ask(control, PolicyWanted(), bearer)
         live = (await ask(control, RegistrationsWanted(), bearer)).registrations
         return await desk.read(bearer, policy_uses, desk.path, current, live, moment)
@@ -288,7 +288,7 @@ def _of_records(services: Services) -> Routes:
         async with services.judging.turn(bearer):
             try:
                 return await asyncio.to_thread(
-                    granted, shown.entry.record, known, whole_tool=tool, until=until
+                    grant_of, shown.entry.record, known, whole_tool=tool, until=until
                 )
             except UngrantableError as error:
                 raise ProblemError(409, "not-by-a-policy", str(error)) from None

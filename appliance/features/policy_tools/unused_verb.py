@@ -9,7 +9,7 @@ from appliance.base.timestamps import local_text
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.features.policy_tools.policy_input import live_now, recorded_period
-from appliance.features.policy_tools.policy_verbs import compiled
+from appliance.features.policy_tools.policy_verbs import compile_or_exit
 from appliance.features.policy_tools.rule_uses import RuleUse, RuleUses
 from rosmop.tool.terminal import printable, say
 
@@ -32,7 +32,7 @@ def list_unused(
     Example: rosrv policy unused --since 30d
     """
     period = recorded_period(appliance, since)
-    uses = RuleUses(compiled(appliance, None, None, None))
+    uses = RuleUses(compile_or_exit(appliance, None, None, None))
     for observation in period.requests():
         uses.add(observation)
     uses.add_live(live_now(appliance))

@@ -9,7 +9,7 @@ import typer
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json
 from appliance.features.policy_tools.policy_input import Enrolled, Robot, usage_error
-from appliance.features.policy_tools.policy_verbs import OptionalFile, compiled, decision_fields
+from appliance.features.policy_tools.policy_verbs import OptionalFile, compile_or_exit, decision_fields
 from appliance.features.policy_tools.who_may import HostAnswer, who_may
 from appliance.policy.actions import VERBS, BadWordError, parse_action
 from appliance.policy.model import Category, Request
@@ -36,7 +36,7 @@ def list_who_may(
         category, resource = parse_action(f"{action} {name}")
     except BadWordError as error:
         raise usage_error(str(error)) from error
-    policy = compiled(appliance, file, robot, enrolled)
+    policy = compile_or_exit(appliance, file, robot, enrolled)
     answers = list(who_may(policy, category, resource, node))
     shown = [answer for answer in answers if answer.decision.rank or answer.near]
     for answer in shown:

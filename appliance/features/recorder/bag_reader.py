@@ -36,7 +36,7 @@ class MessagePosition(NamedTuple):
     offset: int
 
     @classmethod
-    def parsed(cls, text: str) -> Self | None:
+    def parse(cls, text: str) -> Self | None:
         return cls(*map(int, text.split("-"))) if _PLACE.fullmatch(text) else None
 
     def __str__(self) -> str:

@@ -74,7 +74,7 @@ class _Process:
                 reserve=int(settings.audit.reserve_bytes),
                 seconds=None if rules.days is None else rules.days * _DAY,
                 clock=age,
-                dated=age.dated,
+                dated=age.true_date,
             ),
             settings.state / "control" / "audit.db",
             [ring for _index, ring in sorted(self._rings.items())],

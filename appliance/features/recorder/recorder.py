@@ -124,7 +124,7 @@ class Recorder:
                 self._answers.append(recorder_link.RecordingsStated(list(self._store.recordings), making))
                 self._answers += [recorder_link.RecordingClosed(found) for found in self._store.unnoted()]
                 self._answers += [
-                    recorder_link.RecordingRemoved(0, *removed) for removed in self._store.removed()
+                    recorder_link.RecordingRemoved(0, *removed) for removed in self._store.removals()
                 ]
                 self._answers.append(recorder_link.RevisionsWanted())
                 self._report_unmade()

@@ -100,7 +100,7 @@ class RecordingSpan:
     hold: int
     latest: int
 
-    def prolonged(self, now: int) -> int:
+    def prolonged_end(self, now: int) -> int:
         return max(self.ends, min(now + self.hold, self.latest))
 
 
@@ -185,7 +185,7 @@ class RecordingPlan:
         found = self._open.get(own)
         if found is not None and found[1].began <= now <= found[1].ends:
             recording_id, open_span = found
-            self._open[own] = recording_id, replace(open_span, ends=open_span.prolonged(now))
+            self._open[own] = recording_id, replace(open_span, ends=open_span.prolonged_end(now))
             return recording_id, ""
         why_not, since = self._obstacles.get(own, ("", -_OBSTACLE_LASTS))
         if since <= now < since + _OBSTACLE_LASTS:  # not after the clock was set back

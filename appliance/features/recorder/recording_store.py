@@ -197,7 +197,7 @@ class RecordingStore:
     def _gone(self, recording_id: str) -> Path:
         return self._folder / f".{recording_id}.gone"
 
-    def removed(self) -> Iterator[tuple[Recording, str, str]]:
+    def removals(self) -> Iterator[tuple[Recording, str, str]]:
         for folder in self._named(_GONE):
             try:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)

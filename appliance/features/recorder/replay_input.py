@@ -19,7 +19,7 @@ from appliance.features.recorder.recording_answers import OpenRecording, Recordi
 from appliance.features.recorder.requests import RecordingsWanted
 from appliance.features.recorder.verbs import bag_of
 from rosmop.tool.monitor_output import BILLION
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 _SECOND = 1_000_000_000
 
@@ -96,7 +96,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
             pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
         if not pieces:
             text = f"there are no recordings of {span}: {_available(known.recordings)}"
-            raise refused([f"rosrv monitor: {text}; the memory has the last {known.before:g} s"])
+            raise refusal([f"rosrv monitor: {text}; the memory has the last {known.before:g} s"])
         yield pieces
 
 

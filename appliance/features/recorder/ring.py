@@ -333,7 +333,7 @@ class RingWriter:
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
 
-        def crowded(*, of_host: bool) -> bool:
+        def is_crowded(*, of_host: bool) -> bool:
             has, whole = (
                 (host.headers, self._most_of_host) if of_host else (self._headers, self.geometry.blocks)
             )
@@ -345,7 +345,7 @@ class RingWriter:
                 for stream, chain in list(self._chains.items())
                 if chain.writer is None and (not of_host or host in chain.shares)
             )
-            while crowded(of_host=of_host):
+            while is_crowded(of_host=of_host):
                 stream = next(closed, None)
                 if stream is None:
                     return False

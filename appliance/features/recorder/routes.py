@@ -12,10 +12,10 @@ from fastapi import Query, Response
 from fastapi.responses import StreamingResponse
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.moments import given
+from appliance.api.front.moments import parse_moment
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.recording_id import OneId
-from appliance.api.front.route_roles import Investigator, Viewer, answered
+from appliance.api.front.route_roles import Investigator, Viewer, unwrap
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Work, in_thread
@@ -90,12 +90,12 @@ def _add_reading(router: Routes, services: Services) -> None:
         bearer: Bearer,
         what: _Reading[_T],
     ) -> _T:
-        recording = answered(await services.control.ask(asked, bearer))
+        recording = unwrap(await services.control.ask(asked, bearer))
         async with reading.turn(bearer):
             try:
                 return await asyncio.to_thread(what, recording, _bag_of(services, recording.id))
             except FileNotFoundError:
-                raise _gone(recording.id) from None
+                raise _gone_error(recording.id) from None
             except LogUnreadableError as error:
                 raise ProblemError(503, "log-unreadable", str(error)) from error
             except ValueError as error:
@@ -143,7 +143,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         ] = NEIGHBOURS,
     ) -> RecordedMessages:
         """Messages of a recording around a time, as fields. For investigators; the audit log records who read them."""
-        moment = at if is_record(at) else MessagePosition.parsed(at) or _moment(at)
+        moment = at if is_record(at) else MessagePosition.parse(at) or _moment(at)
         assert moment is not None  # noqa: S101  `_moment` returns None only for None
         return await read(
             recording_requests.RecordingRead(recording_id, topic),
@@ -153,11 +153,11 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
-    found = answered(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
+    found = unwrap(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
     try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))
     except FileNotFoundError:
-        raise _gone(found.id) from None
+        raise _gone_error(found.id) from None
     except (OSError, ValueError) as error:
         raise ProblemError(503, "not-available", f"the bag of {found.id} cannot be read: {error}") from error
     name = f"rosrv-{found.id}.{'mcap' if mcap else 'bag'}"
@@ -171,12 +171,12 @@ def _bag_of(services: Services, recording_id: str) -> Path:
     return services.settings.state / "recordings" / recording_id / "recording.bag"
 
 
-def _gone(recording_id: str) -> ProblemError:
+def _gone_error(recording_id: str) -> ProblemError:
     return ProblemError(503, "not-available", f"the bag of {recording_id} no longer exists")
 
 
 def _moment(moment: str | int | None) -> int | None:
-    return given(moment) if isinstance(moment, str) else moment
+    return parse_moment(moment) if isinstance(moment, str) else moment
 
 
 def _pieces_of(path: Path) -> Iterator[bytes]:

@@ -35,7 +35,7 @@ from appliance.features.recorder.timeline import (
     timeline,
 )
 from appliance.policy.host_names import HostInWords
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 if TYPE_CHECKING:
     from appliance.cli.connection.rest_orders import RestWay
@@ -154,7 +154,7 @@ def show_timeline(
         )
     else:
         query = {"since": _in_utc("--since", since), "until": _in_utc("--until", until), "columns": columns}
-        found = _asked(way, f"{recording}/timeline", query, Timeline)
+        found = _ask(way, f"{recording}/timeline", query, Timeline)
     if appliance.as_json:
         say_json(found)
         return
@@ -194,14 +194,14 @@ def messages(
     text = body.triggers[0].record if at is None else at
     way = appliance.way
     if isinstance(way, AdminSocket):
-        place = text if is_record(text) else MessagePosition.parsed(text) or _moment_given("--at", text)
+        place = text if is_record(text) else MessagePosition.parse(text) or _moment_given("--at", text)
         assert place is not None  # noqa: S101  it is text
         appliance.ask_or_exit(recording_requests.RecordingRead(recording, topics))
         found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))
     else:
-        point = text if is_record(text) or MessagePosition.parsed(text) else _in_utc("--at", text)
+        point = text if is_record(text) or MessagePosition.parse(text) else _in_utc("--at", text)
         query = {"at": point, "topic": topics, "neighbours": neighbours}
-        found = _asked(way, f"{recording}/messages", query, RecordedMessages)
+        found = _ask(way, f"{recording}/messages", query, RecordedMessages)
     for number, message in enumerate(found.messages):
         if appliance.as_json:
             say_json(message)
@@ -256,7 +256,7 @@ def fetch(
     finally:
         part.unlink(missing_ok=True)
     if not whole:
-        raise refused([f"rosrv: the bag of {body.id} was changed after it was recorded: its hash differs"])
+        raise refusal([f"rosrv: the bag of {body.id} was changed after it was recorded: its hash differs"])
     if appliance.as_json:
         say_json({"file": str(target), "sha256": body.sha256, "format": "mcap" if mcap else "bag"})
     else:
@@ -279,7 +279,7 @@ def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))
     try:
-        with way.client.streamed("GET", f"/v1/recordings/{recording}/bag") as answer, part.open("wb") as file:
+        with way.client.stream("GET", f"/v1/recordings/{recording}/bag") as answer, part.open("wb") as file:
             for piece in answer.iter_bytes():
                 file.write(piece)
     except (RestProblemError, NotRunningError) as error:
@@ -291,14 +291,14 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
     return way.state / "recordings" / recording.id / "recording.bag"
 
 
-def _asked(way: "RestWay", path: str, query: Mapping[str, object], kind: type[_T]) -> _T:
+def _ask(way: "RestWay", path: str, query: Mapping[str, object], kind: type[_T]) -> _T:
     given = {name: value for name, value in query.items() if value is not None}
     try:
         return msgspec.convert(way.client.call("GET", f"/v1/recordings/{path}", params=given), kind)
     except RestProblemError as problem:
         if problem.kind == "bad-input":
             raise usage_error(str(problem)) from None
-        raise refused([f"rosrv: {problem}"]) from None
+        raise refusal([f"rosrv: {problem}"]) from None
     except NotRunningError as error:
         raise usage_error(str(error)) from None
 
@@ -365,7 +365,7 @@ def _convert(bag: Path, target: Path) -> None:
             made.unlink()
             if not isinstance(error, ValueError):
                 raise
-            raise refused([f"rosrv: cannot convert to MCAP: {error}; fetch the bag without --mcap"]) from None
+            raise refusal([f"rosrv: cannot convert to MCAP: {error}; fetch the bag without --mcap"]) from None
 
 
 def _seconds(option: str, given: str | None) -> float | None:

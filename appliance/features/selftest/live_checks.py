@@ -193,7 +193,7 @@ def running(appliance: Appliance) -> Iterator[SelftestFinding]:
     if not answer.ok:
         yield fail("appliance", answer.error, "see the log of rosrv up")
         return
-    status = answer.given()
+    status = answer.unwrap()
     yield ok(
         "appliance",
         f"{status.version}, {counted(len(status.processes), 'process', 'processes')}, nodes find it at {status.master}",

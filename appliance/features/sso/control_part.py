@@ -120,7 +120,7 @@ class SessionTable:
         return ended
 
     def _usable(self) -> list[_Kept]:
-        return [kept for name, kept in self._kept.items() if not self._ends.passed(ONLINE, name)]
+        return [kept for name, kept in self._kept.items() if not self._ends.is_over(ONLINE, name)]
 
     def _due(self, ended: list[str]) -> None:
         self._drop(*ended)
@@ -188,7 +188,7 @@ class SsoOrders:
         self._changed()
         return session
 
-    async def listed(self, _request: requests.SessionsWanted) -> requests.SignedOnList:
+    async def list_sessions(self, _request: requests.SessionsWanted) -> requests.SignedOnList:
         return requests.SignedOnList(self.sessions.sessions())
 
     async def sign_out(self, request: requests.SignOut, who: str) -> SignedOn:
@@ -256,7 +256,7 @@ async def begin(core: Core) -> ControlPart:
         (
             RequestMethod(requests.SignOnBegin, orders.begin, order=False),
             RequestMethod(requests.SignOnComplete, orders.complete),
-            RequestMethod(requests.SessionsWanted, orders.listed, order=False),
+            RequestMethod(requests.SessionsWanted, orders.list_sessions, order=False),
             RequestMethod(requests.SignOut, orders.sign_out, who=True, full_disk=True),
             RequestMethod(requests.SessionsEnd, orders.end, who=True, full_disk=True),
         )

@@ -52,7 +52,7 @@ def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInP
             f"sso.domains lets in only verified e-mail addresses of {', '.join(wanted.domains)};"
             f" the provider gives {mail or 'none'}"
         )
-    given = mail if wanted.name_claim == "email" else _found(claims, wanted.name_claim)
+    given = mail if wanted.name_claim == "email" else _find(claims, wanted.name_claim)
     if not isinstance(given, str) or not given.strip():
         raise SignOnRefusedError(
             f"the claim {wanted.name_claim} (sso.name_claim) gives no name: it must be a string in the ID token;"
@@ -83,7 +83,7 @@ def _verified_mail(claims: Mapping[str, Any]) -> str:
     return ""
 
 
-def _found(claims: Mapping[str, Any], path: str) -> Any:
+def _find(claims: Mapping[str, Any], path: str) -> Any:
     return next(_at(claims, path), None)
 
 
@@ -101,7 +101,7 @@ def _at(claims: object, path: str) -> Iterator[object]:
 
 
 def _values(claims: Mapping[str, Any], path: str) -> frozenset[str]:
-    found = _found(claims, path)
+    found = _find(claims, path)
     found = [found] if isinstance(found, str) else found
     if not isinstance(found, list) or len(found) > _MAX_VALUES:
         overage = "_claim_names" in claims or claims.get("hasgroups") in (True, "true")

@@ -64,7 +64,7 @@ class ProviderConnection:
                 self._pool() as pool,
                 pool.stream(method, url, headers=sent, content=body) as answer,
             ):
-                return ProviderAnswer(answer.status, await _bounded(url, answer))
+                return ProviderAnswer(answer.status, await _read_bounded(url, answer))
         except TimeoutError:
             raise ProviderError(f"{url}: no complete answer within {EXCHANGE_SECONDS:g} s") from None
         except _FAILURES as error:
@@ -120,7 +120,7 @@ def _tls(wanted: Sso) -> ssl.SSLContext:
     return context
 
 
-async def _bounded(url: str, answer: httpcore.Response) -> bytes:
+async def _read_bounded(url: str, answer: httpcore.Response) -> bytes:
     for name, value in answer.headers:
         if name.lower() == b"content-encoding" and value.lower() != b"identity":
             raise ProviderError(

@@ -16,7 +16,7 @@ from fastapi import Request
 
 from appliance.api.front.problems import ProblemError, too_many
 from appliance.api.front.rates import Buckets
-from appliance.api.front.route_roles import answered
+from appliance.api.front.route_roles import unwrap
 from appliance.api.front.routing import Responses, Routes, body
 from appliance.api.front.services import Services
 from appliance.api.front.streams import peer_of
@@ -164,7 +164,7 @@ def routes(services: Services) -> Routes:
         keys = SessionKeys(brought.id, _bytes(brought.reading), _bytes(brought.verifying))
         rates.begin(peer)
         async with places.place(peer):
-            return answered(await services.control.ask(SignOnBegin(keys, peer, brought.again), None))
+            return unwrap(await services.control.ask(SignOnBegin(keys, peer, brought.again), None))
 
     @router.post("/complete", operation_id="complete_sign_on", responses=_FAILS)
     async def complete(returned: Annotated[Returned, body(Returned)], request: Request) -> SignedOn:
@@ -178,7 +178,7 @@ def routes(services: Services) -> Routes:
             rates.succeeded(peer)
         elif answer.trouble == "refused":
             rates.failed(peer)
-        return answered(answer)
+        return unwrap(answer)
 
     return router
 

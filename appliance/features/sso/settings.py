@@ -195,7 +195,7 @@ class Sso(FeatureSection):
         if "openid" not in self.scopes:
             raise ValueError("scopes must contain openid: without it, the provider gives no ID token")
 
-    def recorded(self) -> dict[str, str]:
+    def audit_values(self) -> dict[str, str]:
         """Return all values if single sign-on is on: they decide who has which role. The secret is not among them."""
         if self.issuer is None:
             return {}

@@ -83,9 +83,9 @@ def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: 
             iat={"essential": True},
         ).validate(claims)
     except ClaimError as error:
-        raise _refused(f"{error}{_ADVICE.get(error.claim, '')}") from None
+        raise _refusal(f"{error}{_ADVICE.get(error.claim, '')}") from None
     except (JoseError, ValueError, TypeError, RecursionError) as error:
-        raise _refused(f"{error}") from None
+        raise _refusal(f"{error}") from None
     _check_rest(claims, expected, now)
     return claims
 
@@ -95,45 +95,45 @@ def _check_rest(claims: dict[str, Any], expected: Expected, now: float) -> None:
     if (isinstance(audience, list) and len(audience) > 1 and "azp" not in claims) or (
         claims.get("azp", expected.client_id) != expected.client_id
     ):
-        raise _refused("it was issued to another client (azp)")
+        raise _refusal("it was issued to another client (azp)")
     for name in ("exp", "iat", "nbf"):
         value = claims.get(name, 0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _LATEST:
-            raise _refused(f"{name} is not a time")
+            raise _refusal(f"{name} is not a time")
     if now - claims["iat"] > _OLDEST_SECONDS + expected.skew:
-        raise _refused(f"it was issued more than {_OLDEST_SECONDS:g} s ago{_CLOCKS}")
+        raise _refusal(f"it was issued more than {_OLDEST_SECONDS:g} s ago{_CLOCKS}")
     subject = claims["sub"]
     if not 0 < len(subject) <= _LONGEST_SUBJECT:
-        raise _refused("sub is not 1 to 255 characters")
+        raise _refusal("sub is not 1 to 255 characters")
 
 
 def _require_texts(claims: dict[str, Any], *names: str) -> None:
     """The library takes a list that contains the expected value for the value."""
     for name in names:
         if name in claims and not isinstance(claims[name], str):
-            raise _refused(f"{name} is not a string")
+            raise _refusal(f"{name} is not a string")
 
 
 def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
     if len(token) > _LONGEST:
-        raise _refused(f"it has more than {_LONGEST} characters: let the provider put fewer groups into it")
+        raise _refusal(f"it has more than {_LONGEST} characters: let the provider put fewer groups into it")
     if not token.isascii() or token.count(".") != 2:
-        raise _refused("it is not a signed token with three parts")
+        raise _refusal("it is not a signed token with three parts")
     text = token.partition(".")[0]
     if len(text) > _LONGEST_HEADER:
-        raise _refused(f"its header has more than {_LONGEST_HEADER} characters")
+        raise _refusal(f"its header has more than {_LONGEST_HEADER} characters")
     try:
         header = json.loads(_decode(text))
     except (ValueError, RecursionError):
-        raise _refused("its header is not JSON") from None
+        raise _refusal("its header is not JSON") from None
     if not isinstance(header, dict) or not isinstance(header.get("kid", ""), str):
-        raise _refused("its header is not a JSON object, or its kid is not a string")
+        raise _refusal("its header is not a JSON object, or its kid is not a string")
     if header.get("alg") not in algorithms:
-        raise _refused(
+        raise _refusal(
             f"it is signed with {str(header.get('alg'))[:20]!r}; sso.algorithms has {', '.join(algorithms)}"
         )
     if "crit" in header or "b64" in header:
-        raise _refused("its header requires an extension (crit)")
+        raise _refusal("its header requires an extension (crit)")
     return header
 
 
@@ -151,23 +151,23 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
     ]
     if len(fitting) != 1:
         named = f"key {header['kid'][:100]!r}" if "kid" in header else "no key"
-        raise _refused(f"it names {named}, and the provider has {len(fitting)} keys that fit")
+        raise _refusal(f"it names {named}, and the provider has {len(fitting)} keys that fit")
     public = {name: fitting[0][name] for name in _PUBLIC if name in fitting[0]}
     try:
         if not curve and 8 * len(_decode(public["n"]).lstrip(b"\0")) < _LEAST_RSA_BITS:
-            raise _refused(
+            raise _refusal(
                 f"the provider's key has less than {_LEAST_RSA_BITS} bits: let it use a longer one"
             )
         return ECKey.import_key(public) if curve else RSAKey.import_key(public)
     except (JoseError, KeyError, ValueError, TypeError, AttributeError) as error:
-        raise _refused(f"the provider's key cannot be used: {error}") from None
+        raise _refusal(f"the provider's key cannot be used: {error}") from None
 
 
 def _decode(text: str) -> bytes:
     return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
 
 
-def _refused(reason: str) -> SignOnRefusedError:
+def _refusal(reason: str) -> SignOnRefusedError:
     return SignOnRefusedError(f"the provider's ID token is not accepted: {reason}")
 
 

@@ -42,7 +42,7 @@ from appliance.ipsec.brought_authority import FOLDER
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import ADMIN_SOCKET, STORED, foreign
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 # Bring the key of an authority, encrypted with a passphrase, to the other appliance.
 #
@@ -225,7 +225,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
     earlier = existing_membership(path)
     left = existing_membership(path.with_name(LEFT_FILE)) if earlier is None else None
     if earlier is not None and not options.again:
-        raise refused(
+        raise refusal(
             [
                 f"{_VERB}: this appliance is already {earlier.name} of a pair with {earlier.other}"
                 f" ({earlier.other_address}); --force makes new keys, and all machines must be set up again"
@@ -244,7 +244,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
         save_membership(path, kits.own)
     except OSError as error:
         shutil.rmtree(options.out)
-        raise refused([f"{_VERB}: {path}: {error.strerror}; nothing was changed"]) from None
+        raise refusal([f"{_VERB}: {path}: {error.strerror}; nothing was changed"]) from None
     _report(plan, options, as_json=as_json)
 
 
@@ -257,14 +257,14 @@ def _require_all_data(state: Path, earlier: Membership) -> None:
     if answer is None:
         _report_age(state, earlier)
         return
-    if answer.ok and answer.given().role == "standby":
+    if answer.ok and answer.unwrap().role == "standby":
         raise usage_error(
             f"this appliance is the standby: run this on the active one, {earlier.other} ({earlier.other_address})."
             " If that machine is lost, stop this appliance first",
             _VERB,
         )
     if not answer.ok and answer.trouble != "unknown":  # a single one, before its restart, has all data
-        raise refused([f"{_VERB}: {answer.error}; try again, or stop this appliance first"])
+        raise refusal([f"{_VERB}: {answer.error}; try again, or stop this appliance first"])
 
 
 def _report_age(state: Path, earlier: Membership) -> None:
@@ -283,7 +283,7 @@ def _with_authority(other: Membership, state: Path) -> Membership:
     except FileNotFoundError:
         return other  # this appliance was never started
     except OSError as error:
-        raise refused([f"{_VERB}: {error.filename or signer}: {error.strerror}; run this as root"]) from None
+        raise refusal([f"{_VERB}: {error.filename or signer}: {error.strerror}; run this as root"]) from None
     if sealed is None:
         return other
     return replace(other, sealed_certificate=sealed.certificate, sealed_key=sealed.key)
@@ -296,7 +296,7 @@ def existing_membership(path: Path) -> Membership | None:
         typer.echo(f"{_VERB}: {error}; it is replaced", err=True)
         return None
     except OSError as error:
-        raise refused([f"{_VERB}: {path}: {error.strerror}; run this as root"]) from None
+        raise refusal([f"{_VERB}: {path}: {error.strerror}; run this as root"]) from None
 
 
 def _require_state(state: Path) -> None:
@@ -305,7 +305,7 @@ def _require_state(state: Path) -> None:
     except OSError as error:
         reason = f"{state}: {error.strerror}; run this as root"
     if reason is not None:
-        raise refused([f"{_VERB}: {reason}"])
+        raise refusal([f"{_VERB}: {reason}"])
 
 
 def _settings(options: JoinOptions) -> Settings:
@@ -314,13 +314,13 @@ def _settings(options: JoinOptions) -> Settings:
         if running.exists():
             return load_resolved(running)
     except OSError as error:
-        raise refused([f"{_VERB}: {running}: {error.strerror}; run this as root"]) from None
+        raise refusal([f"{_VERB}: {running}: {error.strerror}; run this as root"]) from None
     return resolve(options.config, os.environ, {"state": options.state})
 
 
 def _plan(options: JoinOptions, settings: Settings, earlier: Membership | None) -> PairPlan:
     if settings.isolation == "none":
-        raise refused(
+        raise refusal(
             [
                 f"{_VERB}: isolation none has no firewall, so a standby could be used before it is active; start the"
                 " appliance with isolation netns or container"
@@ -344,7 +344,7 @@ def _plan(options: JoinOptions, settings: Settings, earlier: Membership | None) 
         with acting_as_owner(options.state / "lease"):
             epoch = stored_epoch(options.state / "lease" / EPOCH)
     except (OSError, ValueError) as error:
-        raise refused([f"{_VERB}: {error}"]) from None
+        raise refusal([f"{_VERB}: {error}"]) from None
     # Its audit log and the state of its monitors have the appliance's name.
     name = options.name or (earlier.name if earlier is not None else "a")
     other = earlier.other if earlier is not None and earlier.name == name else "a" if name == "b" else "b"
@@ -414,7 +414,7 @@ def _write_kits(kits: Kits, out: Path) -> None:
                 _write(out / folder / member.name, member.text.encode(), member.mode)
     except OSError as error:
         shutil.rmtree(out)
-        raise refused([f"{_VERB}: {out}: {error.strerror}; nothing was changed"]) from None
+        raise refusal([f"{_VERB}: {out}: {error.strerror}; nothing was changed"]) from None
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:

@@ -16,7 +16,7 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
 from appliance.cli.output import moment, say_json, usage_error
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
-from appliance.cli.status_watch import StatusView, Watch, seconds_between, watched
+from appliance.cli.status_watch import StatusView, Watch, seconds_between, watch_status
 from appliance.features.standby.answers import StandbyState
 from appliance.features.standby.requests import StandbyPromote, StandbyWanted
 from appliance.features.standby.summary import CHECKING, present_troubles
@@ -93,7 +93,7 @@ def status(
     each = seconds_between(every, _VERB, watch=watch)
     if watch:
         try:
-            raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
+            raise typer.Exit(watch_status(partial(_look, appliance), each, as_json=appliance.as_json))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
     view = standby_view(appliance.ask_or_exit(StandbyWanted()))
@@ -159,7 +159,7 @@ def _held_by(name: str, appliance: Appliance) -> StandbyState | None:
         except NotRunningError:
             answer = None  # the process that answers is being started again
         if answer is not None and answer.ok:
-            state = answer.given()
+            state = answer.unwrap()
             if state.witness.holder == name:
                 return state
         pause.wait(_AGAIN_SECONDS)

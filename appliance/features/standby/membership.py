@@ -74,7 +74,7 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if self.witness_key and self.witness_key == self.peer_key:
             raise ValueError("the key of the witness and the key of the other appliance must differ")
 
-    def unsealed(self) -> "Membership":
+    def without_secrets(self) -> "Membership":
         return msgspec.structs.replace(self, sealed_certificate="", sealed_key="")
 
     def port_ranges(self) -> tuple[range, ...] | None:
@@ -106,8 +106,8 @@ def load_membership(path: Path) -> Membership | None:
 
 def save_membership(path: Path, membership: Membership, owner: tuple[int, int] | None = None) -> None:
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    write_whole(path, encoded(membership), 0o600, owner)
+    write_whole(path, encode(membership), 0o600, owner)
 
 
-def encoded(membership: Membership) -> bytes:
+def encode(membership: Membership) -> bytes:
     return msgspec.json.format(msgspec.json.encode(membership))

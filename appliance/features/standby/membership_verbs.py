@@ -32,19 +32,19 @@ from appliance.features.standby.membership import (
 from appliance.features.standby.process import EPOCH
 from appliance.supervisor.state_directory import STORED, StateDirectory
 from appliance.supervisor.users import account_of
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 # `rosrv standby join FILE` on the other appliance, whose state becomes a copy of the first one's.
 
 
 def join_second(file: Path, state: Path, *, again: bool, as_json: bool) -> None:
     """Make this appliance the second of a pair. It must be stopped, or later changes would be lost."""
-    membership = _given(file)
+    membership = _read(file)
     directory = StateDirectory(state)
     try:
         backup = _join(membership, state, again=again)
     except OSError as error:
-        raise refused([f"{_VERB}: {error.filename or state}: {error.strerror}; run this as root"]) from None
+        raise refusal([f"{_VERB}: {error.filename or state}: {error.strerror}; run this as root"]) from None
     finally:
         directory.close()
     if as_json:
@@ -60,7 +60,7 @@ def join_second(file: Path, state: Path, *, again: bool, as_json: bool) -> None:
     say(f"Remove {file}: it has private keys.")
 
 
-def _given(file: Path) -> Membership:
+def _read(file: Path) -> Membership:
     try:
         membership = load_membership(file)
     except MembershipError as error:
@@ -82,10 +82,10 @@ def _given(file: Path) -> Membership:
 def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
     path = path_of(state)
     earlier = existing_membership(path)
-    if earlier == membership.unsealed():
+    if earlier == membership.without_secrets():
         return None
     if earlier is not None and not again:
-        raise refused(
+        raise refusal(
             [
                 f"{_VERB}: this appliance is already {earlier.name} of the pair {earlier.name} and {earlier.other};"
                 " leave that pair first (rosrv standby leave), or give --force"
@@ -100,7 +100,7 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
         try:
             back_up(state, backup)
         except BackupError as error:
-            raise refused([f"{_VERB}: {error}; nothing was changed"]) from None
+            raise refusal([f"{_VERB}: {error}; nothing was changed"]) from None
     # An epoch belongs to a pair. This one is kept if the appliance was in this pair: it may have promised something.
     last = earlier or existing_membership(path.with_name(LEFT_FILE))
     if last is None or last.certificate != membership.certificate:
@@ -110,7 +110,7 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
         account = account_of("rosrv-signer")
         sealed = SealedAuthority(membership.sealed_certificate, membership.sealed_key)
         keep_sealed(state / "signer", sealed, (account.uid, account.gid) if os.geteuid() == 0 else None)
-    save_membership(path, membership.unsealed())
+    save_membership(path, membership.without_secrets())
     return backup
 
 

@@ -58,7 +58,7 @@ class SharedAuthority(StoredAuthority):
         return True
 
     async def obstacle(self) -> str:
-        stated, used = await self._signer.stated(), await self.certificate()
+        stated, used = await self._signer.statement(), await self.certificate()
         trouble = f" ({stated.trouble})" if stated.trouble else ""
         self._obstacle = "" if stated.certificate == used else _WAITS + trouble
         return self._obstacle
@@ -209,7 +209,7 @@ class PairedRole(ActiveRole):
 
     @property
     def before_answer(self) -> Callable[[], Awaitable[None]]:
-        return self.replication.stored
+        return self.replication.until_stored
 
     def inherit(self, store: StateStore) -> None:
         pair, settings = self.pair, self._settings

@@ -11,7 +11,7 @@ from appliance.features.standby.membership import (
     LEASE_NICE,
     LINK_FILE,
     MembershipError,
-    encoded,
+    encode,
     load_membership,
     path_of,
 )
@@ -68,7 +68,7 @@ class LeaseWatch(ServiceGate):
         if self.epoch not in (None, epoch):
             self.ended()
         self._until, self._renewable = until, True
-        if self._left() > 0:
+        if self._seconds_left() > 0:
             if self.epoch is None:
                 self.epoch = epoch
                 self._changes.activate(epoch)
@@ -102,7 +102,7 @@ class LeaseWatch(ServiceGate):
 
     def _check(self) -> None:
         self._stop_timer()
-        left = self._left()
+        left = self._seconds_left()
         if left <= _ROUNDING:
             self.lapsed()
         elif self.epoch is not None:
@@ -113,7 +113,7 @@ class LeaseWatch(ServiceGate):
             self._timer.cancel()
             self._timer = None
 
-    def _left(self) -> float:
+    def _seconds_left(self) -> float:
         return self._until - clock.since_boot()
 
 
@@ -140,8 +140,8 @@ def pairing_in(state: Path) -> Pairing | None:
         other=membership.other_address,
         port=membership.port,
         files=(
-            (LEASE_FILE, "rosrv-lease", encoded(membership.for_lease())),
-            (LINK_FILE, "rosrv", encoded(membership.for_control())),
+            (LEASE_FILE, "rosrv-lease", encode(membership.for_lease())),
+            (LINK_FILE, "rosrv", encode(membership.for_control())),
         ),
         nice=LEASE_NICE,
         gate=LeaseWatch,

@@ -256,7 +256,7 @@ def main(lifeline_fd: int, membership: Path) -> None:
     found = load_membership(membership)
     if found is None:
         raise FileNotFoundError(f"{membership} is missing")
-    asyncio.run(LeaseProcess.opened(found, lifeline_fd, Path.cwd() / EPOCH).run())
+    asyncio.run(LeaseProcess.open(found, lifeline_fd, Path.cwd() / EPOCH).run())
 
 
 class LeaseProcess:
@@ -304,7 +304,7 @@ class LeaseProcess:
         self._wake = asyncio.Event()
 
     @classmethod
-    def opened(cls, membership: Membership, lifeline_fd: int, epoch_file: Path) -> Self:
+    def open(cls, membership: Membership, lifeline_fd: int, epoch_file: Path) -> Self:
         """Return the process with its sockets open. Raise `OSError` or `ValueError` if the epoch cannot be read."""
         stored_epoch(epoch_file)  # before a socket is open
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)

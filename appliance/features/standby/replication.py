@@ -301,9 +301,9 @@ class Replication:
         """Stop. A change that is not answered yet gets no answer."""
         self.sender.close()
 
-    async def stored(self) -> None:
+    async def until_stored(self) -> None:
         try:
-            await self.sender.acknowledged(self._database.number)
+            await self.sender.until_acknowledged(self._database.number)
         except ReplicationError as error:
             _log.warning("a change is not answered", reason=str(error))
             await asyncio.get_running_loop().create_future()  # the supervisor ends this process
@@ -337,7 +337,7 @@ class Replication:
             obstacle=lag.obstacle,
         )
 
-    def followed(self) -> bool:
+    def is_followed(self) -> bool:
         return self.sender.lag().connected
 
     def _connected(self) -> bool:
@@ -424,7 +424,7 @@ class Replication:
             number = self._database.number
             if number != synced:
                 with contextlib.suppress(StoreError):  # reported by the store, which tries again
-                    await self._database.settled()
+                    await self._database.until_settled()
                     synced = number
             await asyncio.sleep(_SYNC_SECONDS)
 

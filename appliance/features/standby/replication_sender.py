@@ -6,7 +6,7 @@ have to trust.
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
 2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many,
    so that the large values of a few hosts cost no snapshot. Changes never wait for the standby.
-3. While the appliance answers alone, `acknowledged` does not wait. This ends once the standby has all changes.
+3. While the appliance answers alone, `until_acknowledged` does not wait. This ends once the standby has all changes.
 4. A standby that comes back with less than it acknowledged no longer counts as having those changes.
 """
 
@@ -108,7 +108,7 @@ class ReplicationSender:
         self.alone = False
         self._introduced: Callable[[Introduction], None] = lambda _introduction: None
 
-    async def acknowledged(self, number: int) -> None:
+    async def until_acknowledged(self, number: int) -> None:
         if self.alone:
             return
         if number > self._acknowledged and not self.alone:
@@ -289,7 +289,7 @@ class ReplicationSender:
                             await self._changed.wait()
 
     async def _send_snapshot(self, link: ReplicationLink[FromStandby]) -> int:
-        await self._database.settled()
+        await self._database.until_settled()
         copy = await _in_thread(self._database.copy)
         with contextlib.closing(copy):
             found = copy.execute("SELECT number FROM journal").fetchone()

@@ -228,7 +228,7 @@ async def begin(control: Control) -> ControlPart:
         return _part(StandbyOrders(None, control.trail))
     pair, replication, rollout = role.pair, role.replication, control.monitors.rollout
     recorder = await _begin_epoch(control, pair)
-    copies = StateCopies(pair, store, rollout, replication.followed)
+    copies = StateCopies(pair, store, rollout, replication.is_followed)
 
     def save_parameters() -> None:
         mirror = control.parameters
@@ -255,7 +255,7 @@ async def begin(control: Control) -> ControlPart:
         report = ServiceReport(
             control.settings,
             control.audit,
-            lambda: holds_if_lost(monitors.checked.states, monitors.switches.enabled),
+            lambda: holds_if_lost(monitors.checked.states, monitors.switches.is_enabled),
             relays=lambda: control.relay.presence,
             probe=lambda: control.lifeline.surroundings.probe,
             overdue=control.listener_limits.answering.overdue,

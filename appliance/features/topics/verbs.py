@@ -23,7 +23,7 @@ from appliance.cli.durations import bounded_span, time_given
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
 from appliance.features.topics.requests import TopicLook, TopicMessage
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 from roswire.errors import InvalidNameError
 from roswire.message_view import CUT
 from roswire.names import resolve
@@ -64,7 +64,7 @@ def publishers_at(
     entries = [entry for wanted in (*registrations, *others, *gaps) for entry in export(wanted)]
     entries.sort(key=lambda entry: entry.sequence)
     past = [entry for entry in entries if entry.record.time <= at]
-    known = _registered(past)
+    known = _registrations(past)
     seen = {
         (entry.record.host, entry.record.caller_id) for entry in past if entry.record.event == "registered"
     }
@@ -79,7 +79,7 @@ def publishers_at(
     return PastPublishers(tuple(found), tuple(unknown))
 
 
-def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
+def _registrations(past: Iterable[LogEntry]) -> list[PastPublisher]:
     holders: dict[str, PastPublisher] = {}
     lost: dict[str, PastPublisher] = {}
     for sequence, record in past:
@@ -208,7 +208,7 @@ def echo(
             _show(message, field, as_json=appliance.as_json)
         shown += len(body.messages)
         if not body.messages:
-            raise refused([f"rosrv topic: no message of {topic} in {seconds:g} s"])
+            raise refusal([f"rosrv topic: no message of {topic} in {seconds:g} s"])
 
 
 @speaks
@@ -222,7 +222,7 @@ def info(appliance: Appliance, topic: _Topic) -> None:
     if found is None:
         known = [row.name for row in body.topics]
         near = meant(topic, known) or ": rosrv topic list shows all topics"
-        raise refused([f"rosrv topic: no node publishes or subscribes to {printable(topic)}{near}"])
+        raise refusal([f"rosrv topic: no node publishes or subscribes to {printable(topic)}{near}"])
     if appliance.as_json:
         say_json(found)
     else:

@@ -16,7 +16,7 @@ from appliance.features.table import pairing_in
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refusal, say
 
 # Remove the key of the hosts' authority of a stopped appliance; its next start makes another one.
 #
@@ -79,7 +79,7 @@ def rotate(
     try:
         rotate_authority(state)
     except BackupError as error:
-        raise refused([f"rosrv: {error}"]) from None
+        raise refusal([f"rosrv: {error}"]) from None
     if as_json:
         say_json({"state": str(state)})
         return

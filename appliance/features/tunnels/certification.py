@@ -137,7 +137,7 @@ class Certification:
         self._appliances.is_served(pin)
         self.served.begin(pin)
 
-    def revoked(self, name: str) -> str:
+    def abandon(self, name: str) -> str:
         """End the enrolment or renewal that is in progress for this name; return its address, empty without one."""
         begun, address = self._begun
         if begun != name:
@@ -212,7 +212,7 @@ class Certification:
             await self.tunnels.until_taken()
         )  # the list of revoked certificates is signed and stored by then
         try:
-            await self.store.settled()
+            await self.store.until_settled()
         except StoreError as error:
             stands = f"{name} is enrolled until then and has no kit: rosrv host kit {name}, or revoke it"
             raise StoreError(f"{error}; {stands}") from error
@@ -257,7 +257,7 @@ class Certification:
 
     async def revocations(self, _request: host_requests.RevocationsWanted) -> RevocationList:
         try:
-            listed = await self.tunnels.revocations.signed()
+            listed = await self.tunnels.revocations.signed_list()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
         return RevocationList(listed.decode())
@@ -275,10 +275,10 @@ class Certification:
         """Adopt renewed certificates once the earlier ones have ended, and record each that ends soon or has ended."""
         now = clock.wall()
         self.table.revoked.forget_ended()
-        for row in self.table.enrolled():
+        for row in self.table.hosts():
             if row.expires <= now:
                 self.table.take_next(row.name)
-        for row in self.table.enrolled():
+        for row in self.table.hosts():
             event = "certificate ends soon" if row.expires > now else "certificate ended"
             text = ending(self.table, row, now)
             if text and (event, row.serial) not in self._warned:

@@ -77,7 +77,7 @@ class ViciClient:
                 self._close(host.name)
         self._stated = stated
 
-    def seen(self) -> list[TunnelSeen]:
+    def list_tunnels(self) -> list[TunnelSeen]:
         """Return the open tunnels. charon's confirmation of a close is not trusted.
 
         Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first close
@@ -85,7 +85,7 @@ class ViciClient:
         """
         for _ in range(_LISTS):
             found = self._standing()
-            if not _hidden(found):
+            if not _hidden_tunnels(found):
                 break
         standing = {host for name, _ in found if (host := host_of(name)) is not None}
         for host in sorted(standing - self._loaded.keys()):
@@ -95,7 +95,7 @@ class ViciClient:
             if former is not None and not former.isdisjoint(parts):
                 former |= parts  # a rekeying of the tunnel to end
                 self._end(host_of(name), {"ike-id": _text(row, "uniqueid")})
-        return [one for name, row in found if (one := _seen(name, row)) is not None]
+        return [one for name, row in found if (one := _to_tunnel(name, row)) is not None]
 
     def _standing(self) -> list[tuple[str, _Row]]:
         with self._said("the list of tunnels"):
@@ -172,13 +172,13 @@ def _der_of(pem: bytes) -> bytes:
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
-def _hidden(found: list[tuple[str, _Row]]) -> set[str]:
+def _hidden_tunnels(found: list[tuple[str, _Row]]) -> set[str]:
     """Return tunnels that a list lacks because their keys were replaced while charon made it."""
     rekeyed = {name for name, row in found if _text(row, "state") == "REKEYED"}
-    return rekeyed - {name for name, row in found if _seen(name, row) is not None}
+    return rekeyed - {name for name, row in found if _to_tunnel(name, row) is not None}
 
 
-def _seen(name: str, row: _Row) -> TunnelSeen | None:
+def _to_tunnel(name: str, row: _Row) -> TunnelSeen | None:
     host = host_of(name)
     if host is None or _text(row, "state") not in ("ESTABLISHED", "REKEYING"):
         return None

@@ -40,7 +40,7 @@ async def begin(core: Core) -> ControlPart:
     core.hosts.provide(hosts)
     return ControlPart(
         (
-            RequestMethod(requests.HostList, hosts.listed),
+            RequestMethod(requests.HostList, hosts.list_hosts),
             RequestMethod(requests.HostEndpoint, hosts.endpoint),
             RequestMethod(requests.HostKit, hosts.kit),
             RequestMethod(requests.HostAdd, hosts.add, who=True),

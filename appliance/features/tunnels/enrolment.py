@@ -22,7 +22,7 @@ from appliance.configuration.settings import Settings
 from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels import tunnel_answers as answers
 from appliance.features.tunnels.certification import NO_TUNNELS, Certification
-from appliance.features.tunnels.enrolment_kit import filled
+from appliance.features.tunnels.enrolment_kit import fill
 from appliance.features.tunnels.enrolment_tokens import MAX, USED, BadEnrolmentTokenError
 from appliance.features.tunnels.host_view import HostView, span
 from appliance.features.tunnels.tunnel_answers import Endpoint, KitParts, NewCertificate, PortsReport, Renewed
@@ -114,7 +114,7 @@ class HostSelfService:
             take_effect()
             self._table.keep_next(name, made)
             self._note_renewal(name)
-            await self._certification.store.settled()
+            await self._certification.store.until_settled()
             authority = await self._certification.authority_certificate()
             return NewCertificate(
                 name, made.serial, made.expires, made.certificate.decode(), authority.decode()
@@ -130,7 +130,7 @@ class HostSelfService:
         if row is None:
             raise HostRefusedError(f"{name} has no renewed certificate waiting: renew first")
         self._certification.renewed(name, before, row.serial, row.expires, name)
-        await self._certification.store.settled()
+        await self._certification.store.until_settled()
         asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
         return Renewed(name)
 
@@ -204,7 +204,7 @@ class PortChecks:
             checked=row.checked,
             who=who,
         )
-        await self._certification.store.settled()
+        await self._certification.store.until_settled()
         return PortsReport(self._view.ports(key), self._table.revision, key)
 
     def in_clear_text(self) -> dict[str, int]:
@@ -259,7 +259,7 @@ class HostEnrolment(TunnelHosts):
 
     # --- queries ---
 
-    async def listed(self, _request: host_requests.HostList) -> answers.Hosts:
+    async def list_hosts(self, _request: host_requests.HostList) -> answers.Hosts:
         machines = self.ports.in_clear_text()
         status = self._view.status(machines)
         return answers.Hosts(
@@ -353,7 +353,7 @@ class HostEnrolment(TunnelHosts):
                 expires=row.expires,
                 who=who,
             )
-            await self._store.settled()
+            await self._store.until_settled()
             place = f"[{found.endpoint}]" if ":" in found.endpoint else found.endpoint
             url = f"https://{place}:{self._certification.rest.port}"
             # The script contains no token. It makes the key on the host, and the key never leaves that host. It checks
@@ -368,13 +368,13 @@ class HostEnrolment(TunnelHosts):
                 endpoint=found.endpoint,
                 endpoint_reason=found.reason,
                 **known,
-                script=filled("enrol.sh", {"name": name, "id": row.id, **known}),
+                script=fill("enrol.sh", {"name": name, "id": row.id, **known}),
             )
 
     async def revoke(self, request: host_requests.HostRevoke, who: str) -> answers.Revoked:
         name = request.name
         self._table.require(request.expected)
-        begun = self._certification.revoked(name)
+        begun = self._certification.abandon(name)
         awaited = None if begun else self._awaited.rows().get(name)
         self._awaited.forget(name)
         if (begun or awaited is not None) and (
@@ -395,7 +395,7 @@ class HostEnrolment(TunnelHosts):
             taken_back=taken,
             who=who,
         )
-        await self._store.settled()
+        await self._store.until_settled()
         await self._carried_out()
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
@@ -417,7 +417,7 @@ class HostEnrolment(TunnelHosts):
         return self._table.declared.bundled
 
     async def _declare(self, read: Callable[[], None], who: str) -> answers.Reloaded:
-        before = {row.name for row in self._table.admitted()}
+        before = {row.name for row in self._table.admitted_hosts()}
         earlier = self._table.declared.in_force
         try:
             read()
@@ -425,7 +425,7 @@ class HostEnrolment(TunnelHosts):
             raise HostRefusedError(f"{error}; the previous declaration stays in force") from error
         self._store.save_setting(BUNDLED_HOSTS, self._table.declared.bundled)
         self._keep_text()
-        after = {row.name for row in self._table.admitted()}
+        after = {row.name for row in self._table.admitted_hosts()}
         now, diff = self._table.declared.in_force, self._table.declared.changed_lines(earlier)
         self._table.changed()
         taken = 0
@@ -499,7 +499,7 @@ class HostEnrolment(TunnelHosts):
             more={"id": awaited.id, "expires": awaited.expires} if awaited else None,
             who=who,
         )
-        await self._store.settled()
+        await self._store.until_settled()
         return answers.Revoked(self._table.revision, name, address, "", 0)
 
 

@@ -55,11 +55,11 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
     values |= {"rest": host.rest_url if renews else "", "pin": host.pin if renews else ""}
     values |= {"ike": ", ".join(IKE_PROPOSALS), "esp": ", ".join(ESP_PROPOSALS)}
     for script in _SCRIPTS:
-        found.append((script, filled(script, values), 0o644 if script == "README" else 0o755))
+        found.append((script, fill(script, values), 0o644 if script == "README" else 0o755))
     return found
 
 
-def filled(script: str, values: Mapping[str, str]) -> str:
+def fill(script: str, values: Mapping[str, str]) -> str:
     """Return a script with these values. `@stop@` stands for the file `stop.inc`."""
     folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))

@@ -30,12 +30,12 @@ class EnrolmentTokens:
     def __init__(self, tables: HostTables, ends: EndTable) -> None:
         self._tables = tables
         self._ends = ends
-        self._rows = {row.name: row for row in tables.awaited()}
+        self._rows = {row.name: row for row in tables.enrolment_tokens()}
         ends.when_due(ENROLMENT, self._due)
 
     def rows(self) -> dict[str, EnrolmentTokenRow]:
         """Return the unused tokens by the names of their hosts, with their ends by the present system clock."""
-        self._due([name for name in self._rows if self._ends.passed(ENROLMENT, name)])
+        self._due([name for name in self._rows if self._ends.is_over(ENROLMENT, name)])
         return {
             name: row._replace(expires=self._ends.date(ENROLMENT, name) or row.expires)
             for name, row in self._rows.items()

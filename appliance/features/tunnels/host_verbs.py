@@ -36,7 +36,7 @@ from appliance.features.tunnels.requests import (
 from appliance.features.tunnels.tunnel_answers import EnrolmentToken, KitParts
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network.close_ports import parse_services
-from rosmop.tool.terminal import printable, refused, say
+from rosmop.tool.terminal import printable, refusal, say
 
 # Write a kit or a script to standard output, or to a new file that only its owner can read.
 #
@@ -69,7 +69,7 @@ class Output:
                 self._file.truncate()
             self._file.flush()
         except OSError as error:
-            raise refused([f"rosrv: {self.path}: {error.strerror}; {lost}"]) from None
+            raise refusal([f"rosrv: {self.path}: {error.strerror}; {lost}"]) from None
         self.written = True
 
     def say(self, line: str) -> None:
@@ -136,7 +136,7 @@ def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Ki
         raise usage_error(str(error)) from None
 
 
-def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
+def with_endpoint(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
     if wishes.endpoint:
         return wishes, ""
     found = running.ask_or_exit(HostEndpoint())
@@ -424,7 +424,7 @@ def _write_kit(
 ) -> None:
     with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=running.as_json) as output:
         key, request = key_and_request(csr)
-        wishes, reason = placed(running, wishes)
+        wishes, reason = with_endpoint(running, wishes)
         body = running.ask_or_exit(structs.replace(order, request=request))
         write_kit(output, body, key, wishes, reason, as_json=running.as_json)
 

@@ -122,7 +122,7 @@ class HostView:
             pool=str(self._table.pool),
             address=self._table.own_address,
             hosts_file=str(self._table.declared.path),
-            enrolled=len(self._table.enrolled()),
+            enrolled=len(self._table.hosts()),
             awaited=len(self._awaited.rows()),
             up=len(self._tunnels.seen),
             troubles=[*troubles.values()],
@@ -138,7 +138,7 @@ class HostView:
         ]
 
     def _known_ports(self, machines: Mapping[str, int]) -> dict[str, PortsSeen]:
-        return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
+        return {name: self.ports(name) for name in [*(row.name for row in self._table.hosts()), *machines]}
 
     def _open_ports(self) -> dict[str, str]:
         return {
@@ -161,9 +161,9 @@ class HostView:
 
     def _troubles(self) -> dict[str, str]:
         now, found = clock.wall(), dict[str, str]()
-        if self._table.admitted() and not self._tunnels.enclosed:
+        if self._table.admitted_hosts() and not self._tunnels.enclosed:
             found["firewall"] = f"enrolled hosts cannot connect: {self._tunnels.obstacle}"
-        for row in self._table.enrolled():
+        for row in self._table.hosts():
             if not self._table.is_for_hosts(row.address):
                 found[f"{row.name}:pool"] = outside_the_pool(self._table, row)
             certificate = self._table.certificates.get(row.name)

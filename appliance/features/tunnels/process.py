@@ -202,7 +202,7 @@ class TunnelProcess:
         """
         for _ in range(_LISTINGS):
             changes = self._changes
-            seen = await self._in_turn(vici.seen)
+            seen = await self._in_turn(vici.list_tunnels)
             if changes == self._changes:
                 break
         self._tell(messages.TunnelsReported(self._taken, seen))

@@ -228,7 +228,7 @@ class _CheckTarget:
     services: tuple[protection.OpenService, ...]
     seconds: float
 
-    def wanted(self) -> list[int]:
+    def ports_to_check(self) -> list[int]:
         stay_open = {
             port
             for service in self.services
@@ -239,7 +239,7 @@ class _CheckTarget:
 
 
 def _check(checked: _CheckTarget, running: Appliance) -> None:
-    wanted, found_addresses = checked.wanted(), addresses_of(checked.host)
+    wanted, found_addresses = checked.ports_to_check(), addresses_of(checked.host)
     longest = scanner.longest(len(wanted), checked.seconds) * len(found_addresses)
     if longest > _UNANNOUNCED_SECONDS:
         sys.stderr.write(
@@ -280,7 +280,7 @@ def _report(running: Appliance, result: HostPorts) -> bool:
     if trouble:
         sys.stderr.write(f"rosrv: the result was not reported: {printable(trouble)}\n")
     else:
-        name = answer.given().name or result.name
+        name = answer.unwrap().name or result.name
         sys.stderr.write(f"rosrv: reported to the appliance: the ports of {name} are {result.state}\n")
     return not trouble
 
@@ -295,11 +295,11 @@ def _own(running: Appliance) -> str:
         raise ValueError(f"the appliance's address is unknown: {error}; or {hint}") from None
     if not answer.ok:
         raise ValueError(f"{answer.error}; {hint}")
-    if answer.given().isolation == "none":
+    if answer.unwrap().isolation == "none":
         raise ValueError(
             f"the appliance on this machine has no isolation and only a loopback address; {hint}"
         )
-    return str(urlsplit(answer.given().master).hostname)
+    return str(urlsplit(answer.unwrap().master).hostname)
 
 
 def _sentence(result: ScanResult, ports: PortRange) -> str:

@@ -19,8 +19,8 @@ from msgspec import convert, structs
 from appliance.api.front.etags import etag
 from appliance.api.front.problems import ProblemError, too_many
 from appliance.api.front.rates import Buckets
-from appliance.api.front.route_roles import Operator, Viewer, answered, ask
-from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, file, tagged
+from appliance.api.front.route_roles import Operator, Viewer, ask, unwrap
+from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, file, with_tag
 from appliance.api.front.services import Services
 from appliance.api.front.streams import peer_of
 from appliance.api.routes.operation_routes import Answer, AnsweringRoutes, OperationCall
@@ -87,7 +87,7 @@ def _add_hosts(router: Routes, services: Services) -> None:
 
 async def _token(call: OperationCall[host_requests.HostToken]) -> Tagged[answers.EnrolmentToken]:
     _wishes(call.body)  # rejects invalid options
-    return tagged(await call.ask(call.order))
+    return with_tag(await call.ask(call.order))
 
 
 async def _enrol(call: OperationCall[Any]) -> Response:
@@ -281,7 +281,7 @@ class _Patience:
     def require(self, peer: str) -> None:
         now = clock.now()
         seconds = self._one.wait(peer, now)
-        if self._one.touched(peer, now):
+        if self._one.is_touched(peer, now):
             seconds = max(seconds, self._all.wait(_ALL, now))
         if seconds:
             raise too_many("too-many-failures", "too many wrong enrolment tokens were sent", seconds)
@@ -296,4 +296,4 @@ async def _ask(services: Services, order: AdminRequest[A]) -> A:
     answer = await services.control.ask(order, None)
     if not answer.ok and answer.trouble == "forbidden":
         raise ProblemError(403, "not-recognised", answer.error)
-    return answered(answer)
+    return unwrap(answer)

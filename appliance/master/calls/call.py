@@ -344,7 +344,7 @@ class ServedCall(NamedTuple):
 Table = Mapping[str, ServedCall]
 
 
-def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
+def served_calls(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
     return {call.name: ServedCall(call, part) for call in calls}
 
 

@@ -29,7 +29,7 @@ from appliance.master.calls.call import (
     denial_text,
     with_record,
 )
-from appliance.master.calls.gate import CallGate, NameConflict, contested
+from appliance.master.calls.gate import CallGate, NameConflict, decide_contest
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.calls.registration import given_up
 from appliance.master.endpoints.node_ports import NoPortError
@@ -86,7 +86,7 @@ class KeyTurn:
         self._turns[self] = None
         try:
             for turn in before:
-                await turn.done().wait()
+                await turn.done_event().wait()
         except BaseException:
             self._end()
             raise
@@ -95,7 +95,7 @@ class KeyTurn:
     async def __aexit__(self, *_error: object) -> None:
         self._end()
 
-    def done(self) -> asyncio.Event:
+    def done_event(self) -> asyncio.Event:
         if self._done is None:
             self._done = asyncio.Event()
             if self not in self._turns:
@@ -176,7 +176,7 @@ class Execution:
             return await self._in_turn(visit, attempt, outcome)
         async with self._names.of_name(attempt.caller.caller_id) as later:
             if later or isinstance(outcome, NameConflict):
-                outcome = self._settled(attempt, probe)
+                outcome = self._settle(attempt, probe)
             if call.kind is Kind.PARAMETER:
                 return await self._in_turn(visit, attempt, outcome)
             return await self._carry_out(visit, attempt, outcome)
@@ -184,7 +184,7 @@ class Execution:
     async def _in_turn(self, visit: ServedRequest, attempt: Attempt, outcome: Decision) -> Value:
         async with self._turn([attempt]) as later:
             if later:
-                outcome = self._settled(attempt)
+                outcome = self._settle(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
     async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt], weight: int) -> list[Value]:
@@ -195,7 +195,7 @@ class Execution:
         """
         if weight >= self.large:
             await visit.bulk.take()
-        looks = [self._settled(attempt) for attempt in run]
+        looks = [self._settle(attempt) for attempt in run]
         writing = [
             attempt
             for attempt, look in zip(run, looks, strict=True)
@@ -206,7 +206,7 @@ class Execution:
         async with self._turn(writing) as later:
             if later:
                 looks = [
-                    self._settled(attempt) if look.allowed else look
+                    self._settle(attempt) if look.allowed else look
                     for attempt, look in zip(run, looks, strict=True)
                 ]
             return await self._carry_out_run(visit, run, looks)
@@ -224,7 +224,7 @@ class Execution:
 
     async def _carry_out(self, visit: ServedRequest, attempt: Attempt, decision: Decision) -> Value:
         policy, verb = self.policy(), attempt.call.verb
-        denied = self._recorded(attempt, decision)
+        denied = self._record(attempt, decision)
         if denied is not None and verb is CallVerb.UNREGISTER:
             given_up(self.registry, attempt)
             self.flush()
@@ -243,7 +243,7 @@ class Execution:
     ) -> list[Value]:
         policy, version = self.policy(), self.registry.version
         answers: list[Value] = [
-            self._recorded(attempt, decision) for attempt, decision in zip(run, decisions, strict=True)
+            self._record(attempt, decision) for attempt, decision in zip(run, decisions, strict=True)
         ]
         obstacle = await self._obstacle() if self.trail.strict else None
         writes: list[int] = []
@@ -260,13 +260,13 @@ class Execution:
         outcomes: Sequence[Value | Exception]
         stands = self.policy() is policy and not self.trail.obstacle
         if stands and self.registry.version != version:  # another host may now hold the caller's name
-            stands = all(self._settled(one).allowed for one in wanted)
+            stands = all(self._settle(one).allowed for one in wanted)
         if not wanted or stands:
             outcomes = await self.parameters.write(
                 [ParameterWrite(one.caller, one.resource, one.value) for one in wanted]
             )
         else:  # policy or registry changed while a read waited for the ROS master, or a record for the disk
-            looks = [self._settled(one) for one in wanted]
+            looks = [self._settle(one) for one in wanted]
             outcomes = await self._carry_out_run(visit, wanted, looks)
         for place, outcome in zip(writes, outcomes, strict=True):
             answers[place] = self._failed(run[place], outcome) if isinstance(outcome, Exception) else outcome
@@ -281,11 +281,11 @@ class Execution:
             return Decision(False, None, obstacle)
         return self.gate.decide(attempt, self.parameters.mirror.tree)
 
-    def _settled(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
+    def _settle(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
         outcome = self._decide(attempt)
-        return contested(outcome, probe) if isinstance(outcome, NameConflict) else outcome
+        return decide_contest(outcome, probe) if isinstance(outcome, NameConflict) else outcome
 
-    def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
+    def _record(self, attempt: Attempt, decision: Decision) -> Answer | None:
         request, call = attempt.request, attempt.call
         if decision.asks is not None and not decision.allowed:
             decision = self.hold_call(decision.asks).of(decision)
@@ -337,7 +337,7 @@ class Execution:
                 return [0, with_record(str(error), record), call.denial]
             case NotServedError() | StoreError():
                 decision = Decision(False, None, str(error))
-                return self._recorded(attempt, decision) or [0, str(error), call.denial]
+                return self._record(attempt, decision) or [0, str(error), call.denial]
             case PeerError():
                 return self._malformed(call, caller, error)
             case EncodingError():

@@ -22,7 +22,7 @@ from appliance.master.calls.call import (
     RosCall,
     Table,
     method,
-    served,
+    served_calls,
 )
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
@@ -115,9 +115,9 @@ def master_table(
     monitors: MonitorCalls,
 ) -> Table:
     return {
-        **served(_REGISTRATION, registration),
-        **served(_LOOKUPS, lookups),
-        **served(_PARAMETERS, parameters),
-        **served(_MONITORS, monitors),
-        **served(_INTROSPECTION, Introspection()),
+        **served_calls(_REGISTRATION, registration),
+        **served_calls(_LOOKUPS, lookups),
+        **served_calls(_PARAMETERS, parameters),
+        **served_calls(_MONITORS, monitors),
+        **served_calls(_INTROSPECTION, Introspection()),
     }

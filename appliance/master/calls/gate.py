@@ -38,7 +38,7 @@ class HostLimits:
 
 
 class CallGate:
-    """Decides calls, without side effects. `contested` decides a `NameConflict` by a probe of the holder."""
+    """Decides calls, without side effects. `decide_contest` decides a `NameConflict` by a probe of the holder."""
 
     def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
         self._policy = policy
@@ -96,7 +96,7 @@ class CallGate:
 
     def _taken(self, attempt: Attempt) -> Decision | None:
         if attempt.call.kind is Kind.SERVICE:
-            for provider in self._registry.registered(Kind.SERVICE, attempt.resource):
+            for provider in self._registry.registrants(Kind.SERVICE, attempt.resource):
                 if provider.of_monitors:
                     return _no(f"the service {attempt.resource} belongs to the appliance")
         return None
@@ -175,7 +175,7 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
     )
 
 
-def contested(contest: NameConflict, probe: Probe | None) -> Decision:
+def decide_contest(contest: NameConflict, probe: Probe | None) -> Decision:
     """Return the decision on a contested name: denied unless a probe of this holder found that it is gone."""
     holder = contest.holder
     if probe is not None and probe.holder is holder:

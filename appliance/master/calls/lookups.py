@@ -39,7 +39,7 @@ class LookupCalls:
 
     async def lookup_service(self, caller: Caller, service: str) -> Answer:
         """`lookupService(caller_id, service)` → the relay's port for it; the caller may then call it."""
-        provider = next(iter(self.registry.registered(Kind.SERVICE, service)), None)
+        provider = next(iter(self.registry.registrants(Kind.SERVICE, service)), None)
         if provider is None:
             return [-1, "no provider", ""]
         if provider.of_monitors or self.relay.carries_service(service):

@@ -31,7 +31,7 @@ class MonitorCalls:
         return [
             1,
             "Monitors",
-            [[name, self.monitors.switches.enabled(name)] for name in self.monitors.names()],
+            [[name, self.monitors.switches.is_enabled(name)] for name in self.monitors.names()],
         ]
 
     async def monitor_control(self, caller: Caller, word: str, names: list[str]) -> Answer:
@@ -62,7 +62,7 @@ class MonitorCalls:
             for topic in sorted(topics):
                 ports = [
                     (publisher.outer_port, self.relay.port(publisher, Kind.PUBLICATION, topic))
-                    for publisher in self.registry.registered(Kind.PUBLICATION, topic)
+                    for publisher in self.registry.registrants(Kind.PUBLICATION, topic)
                 ]
                 rows += [[monitor, topic, *pair] for pair in ports or [_NOBODY]]
         return [self.real_port, self.port, rows]

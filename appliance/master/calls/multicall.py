@@ -39,7 +39,7 @@ class Multicall:
     async def answer(self, visit: ServedRequest, params: tuple[Value, ...]) -> Value:
         if len(params) != 1 or not isinstance(params[0], list):
             why = "system.multicall takes one list of calls"
-            self._refused(visit, why)
+            self._refuse(visit, why)
             return [-1, why, 0]
         visit = visit._replace(caller=visit.caller._replace(in_multicall=True))
         left: _Parts = deque(params[0])
@@ -48,7 +48,7 @@ class Multicall:
         while left and not (why := await self._why_no_more(visit, room)):
             if _in_run(visit, left[0]):
                 run = await self._run(visit, left, room)
-                answers = run.answered(await self.execution.answer_run(visit, run.attempts, run.weight))
+                answers = run.merge_answers(await self.execution.answer_run(visit, run.attempts, run.weight))
             else:
                 answers = [await self._one(visit, left.popleft())]
             room -= await self._weigh(visit, answers)
@@ -91,11 +91,11 @@ class Multicall:
             case Attempt():
                 return part
             case {"methodName": "system.multicall"}:
-                return self._refused(visit, "a multicall inside a multicall is not served")
+                return self._refuse(visit, "a multicall inside a multicall is not served")
             case {"methodName": str(method), "params": list(params), **rest} if not rest:
                 attempt = await self.execution.understand(visit, method, params)
                 return attempt if isinstance(attempt, Attempt) else [attempt]
-        return self._refused(visit, _FORM)
+        return self._refuse(visit, _FORM)
 
     async def _weigh(self, visit: ServedRequest, answers: list[Value]) -> int:
         weight = weigh(answers, self.offload)
@@ -104,7 +104,7 @@ class Multicall:
         await visit.bulk.take()
         return await visit.bulk.in_thread(weigh, answers, self.parameters.mirror.bytes_limit)
 
-    def _refused(self, visit: ServedRequest, why: str) -> Value:
+    def _refuse(self, visit: ServedRequest, why: str) -> Value:
         return self._fault(visit, PARSE_FAULT, "malformed", why)
 
     def _fault(self, visit: ServedRequest, code: int, event: str, why: str) -> Value:
@@ -133,7 +133,7 @@ class _Run:
     def longest(self) -> int:
         return _LONGEST_READING if self.reads else _LONGEST_RUN
 
-    def answered(self, attempts: Iterable[Value]) -> list[Value]:
+    def merge_answers(self, attempts: Iterable[Value]) -> list[Value]:
         given = iter(attempts)
         return [[next(given)] if answer is None else answer for answer in self.answers]
 

@@ -26,7 +26,7 @@ from appliance.rpc.server import Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.errors import EncodingError, ProtocolError
-from roswire.names import searched
+from roswire.names import candidate_keys
 from roswire.parameter_tree import names_in, standing_at
 from roswire.xmlrpc import Value
 
@@ -42,7 +42,7 @@ class ParameterRights:
     policy: Callable[[], Policy]
     trail: AuditTrail
 
-    def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
+    def denial_to_read(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
         """Return a denial text if the caller may not read the answer's value.
 
         The decision on the call used an earlier state of the parameters.
@@ -50,7 +50,7 @@ class ParameterRights:
         if answer[0] != 1 or not isinstance(answer[2], dict) or caller.own:
             return None
         decision = self._to_read(caller.peer.host, caller.caller_id, key, answer[2])
-        return None if decision.allowed else self.recorded(caller, call, key, decision)
+        return None if decision.allowed else self.record_denial(caller, call, key, decision)
 
     def may_read_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
         """Return whether a subscriber may read a new value (an empty namespace if it was deleted); record a denial."""
@@ -59,7 +59,7 @@ class ParameterRights:
         decision = self._to_read(incarnation.host, incarnation.name, key, value)
         if not decision.allowed:
             peer = Peer(incarnation.host, str(incarnation.host), incarnation.told)
-            self.recorded(Caller(peer, incarnation.name, clock.now_ns()), "paramUpdate", key, decision)
+            self.record_denial(Caller(peer, incarnation.name, clock.now_ns()), "paramUpdate", key, decision)
         return decision.allowed
 
     def may_know_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
@@ -69,7 +69,7 @@ class ParameterRights:
         request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
         return decide_right(self.policy(), right_to_find(request))
 
-    def recorded(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
+    def record_denial(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
         record = self.trail.decided(caller.asker, call, Category.READ.value, key, decision)
         return denial_text(decision, record, self.policy().tell)
 
@@ -99,7 +99,7 @@ class ParameterCalls:
     async def get_param(self, caller: Caller, key: str) -> Answer:
         """`getParam(caller_id, key)`."""
         answer = await self.read(caller, key)
-        hidden = self.rights.hidden(caller, "getParam", key, answer)
+        hidden = self.rights.denial_to_read(caller, "getParam", key, answer)
         return answer if hidden is None else [0, hidden, 0]
 
     async def read(self, caller: Caller, key: str) -> Answer:
@@ -145,19 +145,19 @@ class ParameterCalls:
         """`searchParam(caller_id, key)` → the name that is found, which the host may read."""
         if caller.own or not caller.caller_id:
             return await self.rosmaster.call(_SEARCH, caller.caller_id, key)
-        places = {name: self.rights.to_find(caller, name) for name in searched(key, caller.caller_id)}
+        places = {name: self.rights.to_find(caller, name) for name in candidate_keys(key, caller.caller_id)}
         hidden = [name for name, decision in places.items() if not decision.allowed]
         if key.startswith("/") and hidden:
-            return [0, self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]]), ""]
+            return [0, self.rights.record_denial(caller, _SEARCH, hidden[0], places[hidden[0]]), ""]
         answer = await self.rosmaster.call(_SEARCH, caller.caller_id, key)
         found = _found(answer)
         if found in hidden:
             found = self._next_readable(key, places, found)
             answer = [1, f"Found [{found}]", found] if found is not None else [-1, "", ""]
         if found is not None and places[found].would_deny:
-            self.rights.recorded(caller, _SEARCH, found, places[found])
+            self.rights.record_denial(caller, _SEARCH, found, places[found])
         if answer[0] != 1 and hidden:
-            why = self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]])
+            why = self.rights.record_denial(caller, _SEARCH, hidden[0], places[hidden[0]])
             return [-1, f"Cannot find parameter [{key}] in an upwards search of readable ones: {why}", ""]
         return answer
 

@@ -54,7 +54,7 @@ class Pipeline:
 
         return handle
 
-    async def ordered(self, table: Table, peer: Peer, call: MethodCall) -> Value:
+    async def run_order(self, table: Table, peer: Peer, call: MethodCall) -> Value:
         """Carry out a call of a node that an operator orders, with policy, quotas and records as for the node's own."""
         await self.addresses.learn(peer)
         caller = Caller(peer, "", clock.now_ns())
@@ -76,7 +76,7 @@ class Pipeline:
             answer = await self._answer(visit, call)
             known = call.method in visit.table or call.method == MULTICALL
             seconds = (clock.now_ns() - visit.caller.arrived) / 1e9
-            self.trail.meter.called(call.method if known else "unknown", seconds)
+            self.trail.meter.count_call(call.method if known else "unknown", seconds)
             if weigh(answer, self.offload) < self.offload:
                 return build_response(answer)
             await visit.bulk.take()

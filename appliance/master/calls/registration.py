@@ -58,7 +58,7 @@ class Arrivals:
     addresses: AdvertisedAddresses
     serve: ServeNode
 
-    def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+    def known_node(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
@@ -220,7 +220,7 @@ class RegistrationCalls:
     async def subscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`subscribeParam(caller_id, caller_api, key)`."""
         read = await self.parameters.read(caller, key)
-        hidden = self.parameters.rights.hidden(caller, "subscribeParam", key, read)
+        hidden = self.parameters.rights.denial_to_read(caller, "subscribeParam", key, read)
         if hidden is not None:
             return [0, hidden, 0]
         if read[0] == 0:  # the ROS master failed
@@ -244,7 +244,7 @@ class RegistrationCalls:
         provider = next(
             (
                 holder
-                for holder in self.registry.registered(Kind.SERVICE, service)
+                for holder in self.registry.registrants(Kind.SERVICE, service)
                 if holder.name == caller.caller_id
                 # The URI has the node's own port, or the port that lookupService returned (`rosnode cleanup`).
                 and (
@@ -255,19 +255,19 @@ class RegistrationCalls:
             None,
         )
         other = f"[{service_api.text}] is no longer the current service api handle for [{service}]"
-        return self._unregistered(caller, provider, Kind.SERVICE, service, other)
+        return self._unregister(caller, provider, Kind.SERVICE, service, other)
 
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`unsubscribeParam(caller_id, caller_api, key)`, with the ROS master's constant answer."""
-        self._unregistered(caller, self.arrivals.known(caller, caller_api), Kind.PARAMETER, key, "")
+        self._unregister(caller, self.arrivals.known_node(caller, caller_api), Kind.PARAMETER, key, "")
         return [1, f"Unsubscribe to parameter [{key}]", 1]
 
     async def _unregister_topic(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
-        node = self.arrivals.known(caller, caller_api) or self._by_lookup_uri(caller, caller_api)
+        node = self.arrivals.known_node(caller, caller_api) or self._by_lookup_uri(caller, caller_api)
         other = f"[{caller.caller_id}] is not a known provider of [{topic}]"
-        return self._unregistered(caller, node, kind, topic, other)
+        return self._unregister(caller, node, kind, topic, other)
 
-    def _unregistered(
+    def _unregister(
         self, caller: Caller, node: Incarnation | None, kind: Kind, resource: str, other: str
     ) -> Answer:
         name = caller.caller_id

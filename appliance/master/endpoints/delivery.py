@@ -179,10 +179,10 @@ class NodeApiClient:
             if there is not None:
                 where = node_uri(uri.host, uri.port, uri.path)
                 raise RefusedError(f"{where} was not called: {there.name} has that address now")
-        client = self._kept(incarnation) if method in _REUSES else self.client(incarnation)
+        client = self._client_of(incarnation) if method in _REUSES else self.client(incarnation)
         return await client.call(method, *params)
 
-    def _kept(self, incarnation: Incarnation) -> XmlRpcClient:
+    def _client_of(self, incarnation: Incarnation) -> XmlRpcClient:
         """Return a client with a kept connection (at most `_MAX_KEPT`): a starting node gets ten calls in a second."""
         uri = incarnation.call_uri
         client = self._used.get(uri) or self._unused.pop(uri, None)

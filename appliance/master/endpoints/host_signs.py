@@ -31,7 +31,7 @@ def host_signs(registry: Registry, carried: RelayTraffic) -> HostSigns:
 
     def published(host: Address, names: frozenset[str]) -> Iterator[Traffic]:
         for name in names:
-            for node in registry.registered(Kind.PUBLICATION, name):
+            for node in registry.registrants(Kind.PUBLICATION, name):
                 if node.host == host:
                     yield carried.traffic.get((node.key, name), Traffic())
 
@@ -43,7 +43,7 @@ def host_signs(registry: Registry, carried: RelayTraffic) -> HostSigns:
         return min(counted, default=clock.now() - since)
 
     def publishers(topic: str) -> list[tuple[Address, str]]:
-        nodes = registry.registered(Kind.PUBLICATION, topic)
+        nodes = registry.registrants(Kind.PUBLICATION, topic)
         return [(node.host, node.name) for node in nodes if not node.own]
 
     return HostSigns(live, moved, publishers, silence)

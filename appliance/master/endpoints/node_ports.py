@@ -65,7 +65,7 @@ class NodePorts:
 
     def _counted(self) -> Pool[Network]:
         whole = len(self._range)
-        bounds = NODE_PORTS.bounds.sized(whole, whole * _TIMES_THE_REST // (_TIMES_THE_REST + 1))
+        bounds = NODE_PORTS.bounds.resize(whole, whole * _TIMES_THE_REST // (_TIMES_THE_REST + 1))
         pool: Pool[Network] = Pool("ports", bounds, lambda _named: QuotaClass.REGISTERED)
         self._owners = {
             port: (host, self._policy().named_as(host)) for port, (host, _named) in self._owners.items()

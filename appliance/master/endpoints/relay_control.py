@@ -184,7 +184,7 @@ class RelayControl:
             self.relay_all
             or topic in policy.monitored_topics
             or policy.limit_rule(topic) is not None
-            or policy.commanded(topic) is not None
+            or policy.command_group(topic) is not None
             or policy.asks_for(Category.PUBLISH, topic)
             or self.monitors().checked.of_topic(topic)
         )
@@ -194,7 +194,7 @@ class RelayControl:
         return (
             self.relay_all
             or service in policy.monitored_services
-            or policy.commanded(service) is not None
+            or policy.command_group(service) is not None
             or policy.asks_for(Category.CALL, service)
             or self.monitors().checked.of_service(service)
         )
@@ -280,15 +280,15 @@ class RelayControl:
 
     def withdraw_moving(self, moves: Sequence[Move]) -> None:
         self._moving |= {(move.kind, move.name) for move in moves}
-        self.flush(self._moved(moves))
+        self.flush(self._move(moves))
 
     def place_moved(self, moves: Sequence[Move]) -> None:
         self._moving -= {(move.kind, move.name) for move in moves}
-        self.flush(self._moved(moves))
+        self.flush(self._move(moves))
 
-    def _moved(self, moves: Iterable[Move]) -> Iterator[Change]:
+    def _move(self, moves: Iterable[Move]) -> Iterator[Change]:
         for move in moves:
-            for node in list(self.registry.registered(_KINDS[move.kind], move.name)):
+            for node in list(self.registry.registrants(_KINDS[move.kind], move.name)):
                 yield RegistrationKey(node, _KINDS[move.kind], move.name)
                 for row in list(self.grants.of(node.key)):
                     if (row.kind, row.resource) == (move.kind, move.name):
@@ -319,7 +319,7 @@ class RelayControl:
                 self._state_node(post, change)
             case RegistrationKey(node, kind, _resource, shelved):
                 if kind in _WORDS and not shelved:
-                    self._state_fact(post, node, change, self._placed(post, change))
+                    self._state_fact(post, node, change, self._place(post, change))
             case PermissionRow():
                 provider = self.registry.by_key(change.key)
                 if provider is not None:
@@ -362,7 +362,7 @@ class RelayControl:
     def _carries(self, post: RelayOutbox, resource: Resource) -> bool:
         return resource not in self._moving and self.allocation.of(*resource) == post.index
 
-    def _placed(self, post: RelayOutbox, fact: RegistrationKey) -> messages.RelayFact | None:
+    def _place(self, post: RelayOutbox, fact: RegistrationKey) -> messages.RelayFact | None:
         node, kind, resource, _shelved = fact
         registration = node.registrations.get((kind, resource)) if node.life is Life.LIVE else None
         if registration is None or not self._carries(post, (_WORDS[kind], resource)):
@@ -371,7 +371,7 @@ class RelayControl:
             return messages.ServicePlaced(node.key, resource, str(node.host), int(registration.detail))
         policy = self.policy()
         together = policy.limit(LimitScope.TOPIC, resource)
-        group, rank = policy.commanded(resource), None
+        group, rank = policy.command_group(resource), None
         if group is not None and group.ranks and not node.own:
             place = group.rank(policy.atoms_of(node.host), node.name)
             rank = None if place is None else self.ranks.place(resource, place, group.free)

@@ -148,7 +148,7 @@ class RelayTraffic:
         """The bytes that each relay holds, by kind."""
         self.counted, self.delayed = SeriesNames(MAX_RESOURCES), SeriesNames(MAX_DELAYED)
 
-    def used(self) -> set[PermissionRow]:
+    def used_permissions(self) -> set[PermissionRow]:
         return {
             PermissionRow(
                 connection.key, connection.kind, connection.resource, connection.host, connection.caller_id
@@ -274,7 +274,7 @@ class RelayTraffic:
 
     def _subscriber(self, connection: messages.ConnectionOpened) -> Incarnation | None:
         topic, subscriber = connection.resource, self._registry.holder(connection.caller_id)
-        publishers = self._registry.registered(Kind.PUBLICATION, topic)
+        publishers = self._registry.registrants(Kind.PUBLICATION, topic)
         if (
             subscriber is None
             or str(subscriber.host) != connection.host

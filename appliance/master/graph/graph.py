@@ -108,7 +108,7 @@ class RosGraph:
         if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
             self.returned(incarnation)
         if kind is Kind.SERVICE:  # like the ROS master, keep only the last provider of a service
-            for provider in list(self.registry.registered(Kind.SERVICE, resource)):
+            for provider in list(self.registry.registrants(Kind.SERVICE, resource)):
                 if provider is not incarnation:
                     self.unregistered(provider, Kind.SERVICE, resource)
         new = (kind, resource) not in incarnation.registrations
@@ -147,7 +147,7 @@ class RosGraph:
             self.registered(incarnation, kind, resource, registration.detail)
 
     def _others_offer(self, incarnation: Incarnation, service: str) -> bool:
-        return any(holder is not incarnation for holder in self.registry.registered(Kind.SERVICE, service))
+        return any(holder is not incarnation for holder in self.registry.registrants(Kind.SERVICE, service))
 
     def _take_name(self, incarnation: Incarnation) -> None:
         """Take the name from its holder, and from all clients of other hosts.

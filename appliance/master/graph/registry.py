@@ -227,7 +227,7 @@ class Registry:
     def all(self) -> list[Incarnation]:
         return list(self._by_key.values())
 
-    def registered(self, kind: Kind, resource: str) -> Iterable[Incarnation]:
+    def registrants(self, kind: Kind, resource: str) -> Iterable[Incarnation]:
         return self._topics.get((kind, resource), {}).values()
 
     def resources(self) -> Iterator[tuple[Kind, str, Iterable[Incarnation]]]:
@@ -314,7 +314,7 @@ class Registry:
             incarnation.api_text
             if incarnation is reader
             else incarnation.uri_for(reader.told, hidden=hidden or reader.own)
-            for incarnation in self.registered(kind, topic)
+            for incarnation in self.registrants(kind, topic)
         )
 
     # --- changing ---

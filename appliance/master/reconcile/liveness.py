@@ -106,7 +106,7 @@ class Watchlist:
     def returned(self, node: Incarnation) -> None:
         self._missed[node.key] = MissedUpdates(set(node.resources(Kind.SUBSCRIPTION)))
 
-    async def filled(self) -> None:
+    async def until_filled(self) -> None:
         await self._filled.wait()
 
     def take(self) -> list[Incarnation]:
@@ -187,7 +187,7 @@ class Liveness:
 
     async def _watch(self) -> None:
         while True:
-            await self.watchlist.filled()
+            await self.watchlist.until_filled()
             self.look_at_watched()
 
     def look_at_watched(self) -> None:

@@ -134,7 +134,7 @@ class Reconciler:
 
     def _entry(self, key: EntryKey, api: str, service: str) -> MasterEntry:
         """Return an entry as the ROS master has it; it does not report the type, so the wanted one is assumed."""
-        wanted = self.entries.wanted(key)
+        wanted = self.entries.wanted_entry(key)
         return MasterEntry(
             api, service if key[0] is Kind.SERVICE else wanted.detail if wanted is not None else ""
         )

@@ -57,7 +57,7 @@ class Subscribers:
                 case RegistrationKey(node, kind, resource):
                     self._state(node, kind, resource)
         for topic in topics:
-            for subscriber in self.registry.registered(Kind.SUBSCRIPTION, topic):
+            for subscriber in self.registry.registrants(Kind.SUBSCRIPTION, topic):
                 self._state(subscriber, Kind.SUBSCRIPTION, topic)
 
     def _state_node(self, node: Incarnation) -> None:
@@ -130,8 +130,8 @@ class Subscribers:
 
     def renew_all(self, topic: str) -> None:
         """Have every subscriber drop a topic's publishers and connect again, at their new ports."""
-        publishers = list(self.registry.registered(Kind.PUBLICATION, topic))
-        for subscriber in self.registry.registered(Kind.SUBSCRIPTION, topic):
+        publishers = list(self.registry.registrants(Kind.PUBLICATION, topic))
+        for subscriber in self.registry.registrants(Kind.SUBSCRIPTION, topic):
             self.renew(subscriber, topic, publishers)
 
     def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> None:
@@ -154,7 +154,7 @@ class Subscribers:
             for topic in subscriber.resources(Kind.SUBSCRIPTION):
                 publishers = [
                     publisher
-                    for publisher in self.registry.registered(Kind.PUBLICATION, topic)
+                    for publisher in self.registry.registrants(Kind.PUBLICATION, topic)
                     if publisher is not subscriber
                     and (publisher.own or subscriber.own or self.relay.carries_topic(topic))
                     and PermissionRow(publisher.key, TOPIC, topic, str(subscriber.host), subscriber.name)
@@ -179,7 +179,7 @@ class Subscribers:
             return
         calls: dict[str, NodeCall] = {}
         for update in updates_of(key, value, self.registry.subscribed_below(key)):
-            for subscriber in self.registry.registered(Kind.PARAMETER, update.subscribed):
+            for subscriber in self.registry.registrants(Kind.PARAMETER, update.subscribed):
                 if update.key == key and subscriber.name == caller_id:
                     continue
                 if update.key not in calls:

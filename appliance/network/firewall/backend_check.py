@@ -20,7 +20,7 @@ def prove(backend: Backend, namespace: Namespace) -> None:
     own, other = os.geteuid(), os.geteuid() + 1
     try:
         for family, address in _LOOPBACK:
-            with namespace.entered():
+            with namespace.inside():
                 server = _listen(family, address)
             if server is None:
                 continue  # the machine lacks this family, so no port needs protection

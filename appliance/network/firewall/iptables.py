@@ -192,7 +192,7 @@ def _matches(rule: PacketRule, family: Family) -> tuple[Extension, ...]:
     ends = (("dst-type", rule.local_destination), ("src-type", rule.local_source))
     if local := tuple((name, "LOCAL") for name, is_matched in ends if is_matched):
         matches.append(("addrtype", local))
-    matches += _tracked(rule)
+    matches += _tracking(rule)
     if rule.distant:
         name, below = ("hl", "hl-lt") if family == 6 else ("ttl", "ttl-lt")
         matches.append((name, ((below, "255"),)))
@@ -201,7 +201,7 @@ def _matches(rule: PacketRule, family: Family) -> tuple[Extension, ...]:
     return (*matches, ("comment", (("comment", rule.purpose),)))
 
 
-def _tracked(rule: PacketRule) -> list[Extension]:
+def _tracking(rule: PacketRule) -> list[Extension]:
     matches: list[Extension] = []
     if rule.new_connection:
         matches.append(("conntrack", (("ctstate", "NEW"),)))

@@ -178,7 +178,7 @@ def _body(rule: PacketRule, head: list[Json], family: int | None) -> Json:
     if rule.clear_text:
         through: Json = {"rt": {"key": "ipsec"}} if rule.chain is Chain.OUT else _meta("ipsec")
         expressions.append(_match(through, False))
-    expressions += [*_origin(rule, protocol), *_tracked(rule)]
+    expressions += [*_origin(rule, protocol), *_tracking(rule)]
     if rule.above is not None:
         expressions.append(_over_limit(rule, protocol))
     expressions += [{"counter": None}, _verdict(rule, protocol)]
@@ -198,7 +198,7 @@ def _origin(rule: PacketRule, protocol: str) -> list[Json]:
     return expressions
 
 
-def _tracked(rule: PacketRule) -> list[Json]:
+def _tracking(rule: PacketRule) -> list[Json]:
     expressions: list[Json] = []
     if rule.new_connection:
         expressions.append(_match({"ct": {"key": "state"}}, "new", "in"))

@@ -24,7 +24,7 @@ _BUFFER = 1 << 20
 
 
 class RuleWatch:
-    """Hears changes of some tables by a socket of `subscribed`; without names, of all."""
+    """Hears changes of some tables by a socket of `subscribe`; without names, of all."""
 
     def __init__(self, opened: socket.socket, tables: frozenset[str] = frozenset()) -> None:
         self._tables = tables
@@ -64,12 +64,12 @@ class RuleWatch:
                 self._touched = self._touched or not self._tables or table in self._tables
 
 
-def subscribed(namespace: Namespace) -> socket.socket:
+def subscribe(namespace: Namespace) -> socket.socket:
     """Return a socket that hears the changes in a namespace. Raises `OSError`."""
-    return namespace.run(_subscribed)
+    return namespace.run(_subscribe)
 
 
-def _subscribed() -> socket.socket:
+def _subscribe() -> socket.socket:
     opened = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _NETLINK_NETFILTER)
     opened.setblocking(False)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)

@@ -48,13 +48,13 @@ class HeaderCandidates:
             for turn in zip_longest(*hosts.values(), fillvalue={}):
                 yield from turn
 
-        def registered() -> str:
+        def registered_type() -> str:
             publication = context.table.publication(topic.key, topic.topic)
             return "" if publication is None else publication.type
 
-        return cls(claims, registered)
+        return cls(claims, registered_type)
 
-    def refused(self) -> bool:
+    def advance(self) -> bool:
         """Choose the next fields; return False at the end of a row."""
         self._refused.add(_key(self.fields))
         named: dict[_Key, Mapping[str, str]] = {}

@@ -20,7 +20,7 @@ _LONGEST = 1024
 """The most characters of a header field, because the relay keeps some fields as long as the peer is connected."""
 
 
-def kept(fields: Mapping[str, str]) -> dict[str, str]:
+def peer_fields(fields: Mapping[str, str]) -> dict[str, str]:
     return _known(fields, _OF_PEER)
 
 

@@ -185,10 +185,10 @@ class RefusedConnection:
         self._ended = ended
         self._timer = context.loop.after(context.limits.farewell, self.close)
         received, broken, payer = self._on_data, lambda _reason: self.close(), context.payer(host)
-        self._stream = BufferedSocket(context.loop, sock, received, broken, payer=payer, drained=self._told)
+        self._stream = BufferedSocket(context.loop, sock, received, broken, payer=payer, drained=self._tell)
         self._stream.send(encode_header({"error": reason}))
         if self.live and not self._stream.backlog:
-            self._told()
+            self._tell()
 
     def make_room(self) -> None:
         self.close()
@@ -200,7 +200,7 @@ class RefusedConnection:
             self._stream.close()
             self._ended(self)
 
-    def _told(self) -> None:
+    def _tell(self) -> None:
         self._stream.finish()
 
     def _on_data(self, data: bytes) -> None:

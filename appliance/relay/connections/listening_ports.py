@@ -38,7 +38,7 @@ class ListeningPorts:
         self._listening: dict[str, socket.socket] = {}
         self._make_room = make_room
         limits, quota_class = context.limits, context.table.quota_class
-        bounds = RELAY_CONNECTIONS.bounds.sized(limits.connections, limits.connections_per_host)
+        bounds = RELAY_CONNECTIONS.bounds.resize(limits.connections, limits.connections_per_host)
         self.connected: Pool[str] = Pool("connections to the relay", bounds, quota_class)
 
     def open(self, key: str, descriptor: int) -> None:
@@ -66,7 +66,7 @@ class ListeningPorts:
         self._loop.watch(sock.fileno(), READ, lambda _events: self._accept(key, sock), ACCEPTING)
 
     def _accept(self, key: str, listening: socket.socket) -> None:
-        used = self._loop.used()
+        used = self._loop.time_used()
         while used < QUANTUM:
             try:
                 sock, address = listening.accept()
@@ -76,12 +76,12 @@ class ListeningPorts:
                 if error.errno in _EXHAUSTED:
                     self._pause(key, listening)
                     return
-                used = self._loop.used()
+                used = self._loop.time_used()
                 continue  # this peer has left already; the next may be connected
             host = address[0].removeprefix("::ffff:")
             payer = self._payer(host)
             self._receive(key, sock, host)
-            before, used = used, self._loop.used()
+            before, used = used, self._loop.time_used()
             self._loop.charge(payer, used - before)
 
     def _receive(self, key: str, sock: socket.socket, host: str) -> None:

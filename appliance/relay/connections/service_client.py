@@ -255,7 +255,7 @@ class ServiceClient:
     def tidy(self) -> None:
         held = self._exchange.unfinished + self._unsent
         patience = SMALL if any(weight.share.exhausted for weight in self._weights) else _PATIENT
-        if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
+        if self._stall.has_stalled(held if held > patience else 0, self._context.loop.clock()):
             seconds = self._context.limits.stall_seconds
             self.cut(f"{held} bytes of a message wait, without progress for {seconds:g} s")
 

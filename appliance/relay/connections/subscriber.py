@@ -263,7 +263,7 @@ class Subscriber:
     def check_stall(self) -> None:
         """Cut a subscriber that stalls within a message while its host's memory is exhausted."""
         begun = self._queue.begun if self.exhausted else 0
-        if self._stall.seen(begun, self._loop.clock()):
+        if self._stall.has_stalled(begun, self._loop.clock()):
             self.cut("its host has no memory left in the relay, and it does not accept the rest of a message")
 
     def cut(self, reason: str) -> None:

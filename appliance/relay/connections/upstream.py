@@ -241,7 +241,7 @@ class PublisherConnection(Upstream):
         lose(f"no connection to the publisher: {reason}")
 
     def _turned_away(self, reason: str, violation: Violation = "") -> None:
-        if self._headers.refused():
+        if self._headers.advance():
             self._drop_connection()
             self.ask()
         else:

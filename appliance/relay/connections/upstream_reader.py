@@ -89,7 +89,7 @@ class UpstreamReader:
         self._receiver.trim_buffer()
         is_read = self._pause is None and self._state is _State.WATCHED
         held = self._receiver.unfinished if is_read else 0
-        if self._stall.seen(held, self._loop.clock()):
+        if self._stall.has_stalled(held, self._loop.clock()):
             seconds = self._context.limits.stall_seconds
             reason = f"{held} bytes of a message arrived, then no data for {seconds:g} s"
             self._lost(reason, "limit exceeded")

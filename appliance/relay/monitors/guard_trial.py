@@ -98,7 +98,7 @@ class _Copy:
     def act(self, outcome: Outcome, topic: str) -> str:
         """Return what the guard did to a motion, or an empty text; `topic` is that of the last message."""
         guard, command, monitors = self._wanted.monitor, self._wanted.command, self.monitors
-        for sent in outcome.sent():
+        for sent in outcome.sent_messages():
             if monitors.sends_safe(guard, sent.topic, sent.data) or sent.topic.endswith("/cancel"):
                 return "stopped"
         if topic == command and outcome.result == "changed":
@@ -108,7 +108,7 @@ class _Copy:
         return "withheld" if monitors.withheld_from(command) else ""
 
 
-def tried(
+def try_guard(
     stated: SpecificationsStated,
     given: Mapping[str, Mapping[str, GivenValue]],
     wanted: GuardTestWanted,
@@ -153,7 +153,7 @@ class GuardTrials:
         self._era = 0
 
     def order(self, wanted: GuardTestWanted) -> None:
-        found = self._interceptor.copied(wanted.monitor)
+        found = self._interceptor.copy_source(wanted.monitor)
         why = found if isinstance(found, str) else "another guard is being tested" if self._beside else ""
         if why or isinstance(found, str):
             self._tell(GuardTested(wanted.number, why))
@@ -163,7 +163,7 @@ class GuardTrials:
 
         def work() -> Trial | str:
             try:
-                return tried(stated, given, wanted, self._interceptor.budget)
+                return try_guard(stated, given, wanted, self._interceptor.budget)
             except Exception as error:  # noqa: BLE001  a defect of a copy must not end the relay
                 return f"the copy could not be made: {error}"
 

@@ -116,12 +116,12 @@ class Heartbeat:
         interceptor, observer = self._interceptor, self._interceptor.observer
         busy = max(now - self._due, self._loop.take_longest())
         if busy > self._late:
-            observer.timed(interceptor.acting, "the relay was busy, so a tick or a message", 1, busy)
+            observer.count_times(interceptor.acting, "the relay was busy, so a tick or a message", 1, busy)
         for topic in self._topics():
             late, longest = topic.take_late()
             if late:
                 what = f"a message of {topic.topic}"
-                observer.timed(interceptor.judges(topic.topic), what, 0, longest, late)
+                observer.count_times(interceptor.judges(topic.topic), what, 0, longest, late)
 
     def _stop_waits(self) -> str:
         """Return which stop has waited since the last check for a subscriber to take it."""

@@ -33,9 +33,9 @@ from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
-from appliance.relay.monitors.observer import Observer, dropped, refusal
+from appliance.relay.monitors.observer import Observer, dropped_outcome, refusal
 from appliance.relay.monitors.shadow import ShadowMonitors
-from appliance.relay.monitors.state_keeper import LEAVING, StateKeeper, continued, start_outcome, state_left
+from appliance.relay.monitors.state_keeper import LEAVING, StateKeeper, clock_shift, start_outcome, state_left
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace
 from appliance.relay.monitors.time_budget import TimeBudgets
 from appliance.relay.report import Reporter
@@ -101,7 +101,7 @@ def hold_begun(monitors: MonitorSet, message: SpecificationsStated, switches: Ma
             monitors.resume(monitor.name)
 
 
-def taken(
+def taken_report(
     message: SpecificationsStated, began: list[str], monitors: MonitorSet | None
 ) -> SpecificationsTaken:
     held = [] if monitors is None else [monitor for monitor in monitors.monitors if monitor.held]
@@ -223,7 +223,7 @@ class Interceptor:
         result.name_senders(self.senders.names)
         before, first = self.monitors, self._stated is None or bool(self.blocked)
         if before is None and first:
-            self.offset += continued(message, self._keeper, self.now())
+            self.offset += clock_shift(message, self._keeper, self.now())
         now = self.now()
         if before is None:
             outcome = start_outcome(result, message, self._keeper, now, restarted=first and message.restarted)
@@ -255,7 +255,7 @@ class Interceptor:
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
         switched = self._apply()
         self._changed(None if anew is None else anew | switched)
-        self._reporter.send(taken(message, began, self.monitors))
+        self._reporter.send(taken_report(message, began, self.monitors))
 
     def _apply(self) -> frozenset[str]:
         """Switch the monitors, and give them their constants; return the topics of those that were switched."""
@@ -276,7 +276,7 @@ class Interceptor:
     def _tell_held(self) -> None:
         self.invalidate_prepared()
         if self._stated is not None:
-            self._reporter.send(taken(self._stated, [], self.monitors))
+            self._reporter.send(taken_report(self._stated, [], self.monitors))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
         self.invalidate_prepared()
@@ -327,7 +327,7 @@ class Interceptor:
             return "ticks of the monitors are overdue"
         return monitors.unfit()
 
-    def copied(self, guard: str) -> tuple[SpecificationsStated, dict[str, dict[str, GivenValue]]] | str:
+    def copy_source(self, guard: str) -> tuple[SpecificationsStated, dict[str, dict[str, GivenValue]]] | str:
         """Return what a copy of a monitor in force is made from, or why there is none."""
         if self._stated is None or self.blocked or self.monitors is None:
             return self.blocked or "the relay has no specifications yet"
@@ -351,7 +351,7 @@ class Interceptor:
         return self.monitors is not None and self.monitors.is_safe(topic, data)
 
     def refuse_replay(self, point: ObservationPoint, body: memoryview) -> None:
-        self.observer.dropped(dropped(body, self.now(), _REPLAYED), point, body)
+        self.observer.dropped(dropped_outcome(body, self.now(), _REPLAYED), point, body)
 
     def _stoppers(self, topic: str, *, begin: bool) -> list[str]:
         if self.monitors is None:
@@ -462,7 +462,7 @@ class Interceptor:
                     service, part, bytearray(body), now, MessageSender(self.senders.number(point))
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                outcome = dropped(view, now, self.observer.defect(error, point, now))
+                outcome = dropped_outcome(view, now, self.observer.defect(error, point, now))
             if any(fault.over for fault in outcome.faults):
                 time_budget.cut(now, len(body))
             if self.monitors.tapped:

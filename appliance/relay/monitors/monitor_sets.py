@@ -18,7 +18,7 @@ def monitor_set(
     message: SpecificationsStated, holder_of: Callable[[int], Hashable]
 ) -> MonitorSet | list[str]:
     try:
-        compiled, fast = load.loaded(message.part)
+        compiled, fast = load.load_part(message.part)
     except ValueError as error:
         return [f"control's specifications cannot be decoded: {error}"]
     return MonitorSet.of(

@@ -20,7 +20,7 @@ from appliance.relay.monitors.observations import LONGEST_TEXT, SHOWN, Observati
 from rosmop.run.outcomes import (
     Outcome,
     Verdict,
-    named,
+    label_of,
     of_change,
     of_drop,
     of_fault,
@@ -108,21 +108,21 @@ class Observer:
         return self._observations.was_reported("drop", monitor, point)
 
     def hides_verdict(self, verdict: Verdict, point: ObservationPoint) -> bool:
-        return self._observations.was_reported("verdict", verdict.monitor, point, named(verdict))
+        return self._observations.was_reported("verdict", verdict.monitor, point, label_of(verdict))
 
     def asks(self, verdict: Verdict, source: int) -> bool:
         """Return whether to explain a verdict: at most `_EXPLAINED` a second, of those reported in full."""
         point = self.senders.point(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
-            self._observations.was_reported(kind, verdict.monitor, point, named(verdict))
+            self._observations.was_reported(kind, verdict.monitor, point, label_of(verdict))
             or self._second.explained >= _EXPLAINED
         ):
             return False
         self._second.explained += 1
         return True
 
-    def timed(
+    def count_times(
         self, monitors: Iterable[str], what: str, count: int, longest: float, late: int | None = None
     ) -> None:
         """Count what monitors did; `longest` is the longest delay in seconds, `late` the number beyond the bound."""
@@ -268,10 +268,10 @@ class Observer:
     def _send(self, outcome: Outcome) -> None:
         for earlier in outcome.before:
             self._send(earlier)
-        for published in outcome.sent():
+        for published in outcome.sent_messages():
             self._publish(published)
         if outcome.timer is not None and not self._prefix:
-            self.timed([_monitor(outcome.timer)], "a tick", 1, (self._now() - outcome.time) / 1e9)
+            self.count_times([_monitor(outcome.timer)], "a tick", 1, (self._now() - outcome.time) / 1e9)
         for judged in outcome.judged.values():
             self._send(judged)
 
@@ -431,7 +431,7 @@ class Observer:
         for owed in self._owed:
             lane, point = owed.lane, owed.point
             dropped, changed, told = owed.take()
-            for events, count in zip(lane.events, lane.happened(), strict=True):
+            for events, count in zip(lane.events, lane.take_events(), strict=True):
                 self._happened[events] = self._happened.get(events, 0) + count
             for monitor, (times, first, last) in zip(lane.monitors, dropped, strict=True):
                 if times:
@@ -446,9 +446,9 @@ class Observer:
                         point,
                         last,
                         times,
-                        text=named(verdict),
+                        text=label_of(verdict),
                         first=first,
-                        distinction=named(verdict),
+                        distinction=label_of(verdict),
                         shared={"category": verdict.category},
                     )
             for writers, messages in changed.items():
@@ -481,8 +481,8 @@ class Observer:
                 verdict.monitor,
                 point,
                 outcome.time,
-                named(verdict),
-                distinction=named(verdict),
+                label_of(verdict),
+                distinction=label_of(verdict),
                 shared={"category": verdict.category},
                 detail=of_verdict(outcome, verdict, self._who),
                 after=bytes(outcome.buffer[:SHOWN]),
@@ -520,7 +520,7 @@ class Observer:
         return self._counters.setdefault(monitor, MonitorRow(monitor))
 
 
-def dropped(body: memoryview, now: int, reason: str) -> Outcome:
+def dropped_outcome(body: memoryview, now: int, reason: str) -> Outcome:
     outcome = Outcome(body, now)
     outcome.result, outcome.reason = "dropped", reason
     return outcome

@@ -93,7 +93,7 @@ class StateKeeper:
         self._by_channel: dict[str, _Entry] = {}
         self._copied: list[tuple[bytes, bytes | None]] | None = None  # the sections of the last copy
         self.shift = 0
-        """The nanoseconds that a takeover added to the clock of monitors; `continued` sets it."""
+        """The nanoseconds that a takeover added to the clock of monitors; `clock_shift` sets it."""
 
     @property
     def offset(self) -> int:
@@ -102,7 +102,7 @@ class StateKeeper:
 
     # --- state that an earlier process left ---
 
-    def recovered(self) -> RecoveredState | None:
+    def recover(self) -> RecoveredState | None:
         found = RecoveredState()
         heads = sorted(self._readable(found), key=lambda each: each[0].written)
         for head, sections in heads:
@@ -250,7 +250,7 @@ def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
     return StateLeft(message.number, content, keeper.offset + clock.now_ns())
 
 
-def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
+def clock_shift(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
     """Return the nanoseconds to add to the clock of monitors before their first start.
 
     The clock continues where the other appliance, or the relay that this one replaces, stopped it.
@@ -279,7 +279,7 @@ def start_outcome(
 
     `restarted`: this relay replaces a dead one. `now` is the time of monitors (ns).
     """
-    left = keeper.recovered() if keeper is not None else None
+    left = keeper.recover() if keeper is not None else None
     if message.left or message.lost:
         left = received_states(message.left)
         if message.lost:

@@ -143,7 +143,7 @@ class _Section:
         memory[length : length + _LENGTH.size] = _LENGTH.pack(len(base))
 
 
-def mapped(descriptor: int, *, writable: bool) -> memoryview:
+def map_memory(descriptor: int, *, writable: bool) -> memoryview:
     access = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED, prot=access)
     os.close(descriptor)

@@ -36,10 +36,10 @@ class TimeBudget:
         if now < self._until:
             self._size = min(self._size, size)
             return
-        self._length = _SHORTEST if self.recovered(now) else min(2 * self._length, _LONGEST)
+        self._length = _SHORTEST if self.has_recovered(now) else min(2 * self._length, _LONGEST)
         self._until, self._size = now + self._length, size
 
-    def recovered(self, now: int) -> bool:
+    def has_recovered(self, now: int) -> bool:
         return now >= self._until + self._length
 
 
@@ -59,4 +59,4 @@ class TimeBudgets:
         return self._own[point]
 
     def forget_recovered(self, now: int) -> None:
-        self._own = {point: budget for point, budget in self._own.items() if not budget.recovered(now)}
+        self._own = {point: budget for point, budget in self._own.items() if not budget.has_recovered(now)}

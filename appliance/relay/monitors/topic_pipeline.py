@@ -13,7 +13,7 @@ from appliance.relay.monitors.fast_path_counts import FastPathCounts
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.observation_points import HEAD, BatchProgress, ObservationPoint, ObservedMessage
 from appliance.relay.monitors.observations import SHOWN
-from appliance.relay.monitors.observer import dropped
+from appliance.relay.monitors.observer import dropped_outcome
 from appliance.relay.monitors.state_memory import NOT_KEPT
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.pump import ModuleCall
@@ -48,11 +48,11 @@ class TopicPipeline:
 
     def through(self, batch: Batch) -> Batch | None:
         """Return the frames to pass on, after the monitors' state has been kept."""
-        judged = self._judged(batch)
+        judged = self._judge(batch)
         self._interceptor.keep(self.point[1])
         return judged
 
-    def _judged(self, batch: Batch) -> Batch | None:
+    def _judge(self, batch: Batch) -> Batch | None:
         interceptor = self._interceptor
         now = batch.judged = batch.judged or interceptor.now()
         prepared = self._prepared
@@ -155,7 +155,7 @@ class TopicPipeline:
     def _report(self, walked: BatchResult, progress: BatchProgress) -> None:
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         assert monitors is not None  # noqa: S101  they have put it out
-        head = HEAD if monitors.stamped(self.point[1]) else 0
+        head = HEAD if monitors.is_stamped(self.point[1]) else 0
         for position, line in walked.output:
             first = position + 4
             size = _unpack_length(progress.view, position)[0]
@@ -194,7 +194,7 @@ class TopicPipeline:
         view, position, end = progress.view, progress.position, progress.end
         topic = point[1]
         shows = observer.shows(point)
-        head = HEAD if monitors.stamped(topic) else 0
+        head = HEAD if monitors.is_stamped(topic) else 0
         number = progress.number_at(position) if monitors.taps(topic) else 0
         looked = 0
         interceptor.invalidate_prepared()
@@ -239,7 +239,7 @@ class TopicPipeline:
         if tried != "left" and (lane := monitors.lane(point[1])) is not None:  # it may be one of the lane
             self._defect = lane
             return self._process(monitors, body, now, observed, "left")
-        return dropped(body, now, defect)
+        return dropped_outcome(body, now, defect)
 
     def _block(self, batch: Batch, progress: BatchProgress) -> Batch | None:
         if not self._interceptor.blocked:
@@ -248,7 +248,7 @@ class TopicPipeline:
         while position < progress.end:
             following = position + 4 + _unpack_length(progress.view, position)[0]
             body = progress.view[position + 4 : following]
-            outcome = dropped(body, progress.time, self._interceptor.blocked)
+            outcome = dropped_outcome(body, progress.time, self._interceptor.blocked)
             self._interceptor.observer.dropped(
                 outcome, self.point, body, ObservedMessage(progress, position, b"")
             )

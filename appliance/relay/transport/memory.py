@@ -88,14 +88,14 @@ class RelayMemory:
         together = sum(row.bounds.whole for row in rows)
 
         def pool_of(row: QuotaRow, whole: int) -> MemoryPool:
-            return MemoryPool(row.thing.partition(" in ")[0], row.bounds.sized(whole), quota_class)
+            return MemoryPool(row.thing.partition(" in ")[0], row.bounds.resize(whole), quota_class)
 
         frames, queues, latched = (
             pool_of(row, row.bounds.whole * limits.memory_bytes // together) for row in rows
         )
         return cls(frames, queues, latched, pool_of(RELAY_HEADERS, limits.header_memory_bytes))
 
-    def held(self) -> dict[str, int]:
+    def bytes_held(self) -> dict[str, int]:
         return {
             "frames": self.frames.total,
             "queues": self.queues.total,
@@ -125,7 +125,7 @@ class StallDetector:
         self._held = 0
         self._since = 0.0
 
-    def seen(self, held: int, now: float) -> bool:
+    def has_stalled(self, held: int, now: float) -> bool:
         """Return whether the bytes held (0: nothing is unfinished) have not changed for too long."""
         if not held or held != self._held:
             self._held, self._since = held, now

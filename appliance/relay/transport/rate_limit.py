@@ -67,7 +67,7 @@ class _Store:
             left -= given
         self._common = min(self._common + left, self._most_common)
 
-    def left(self, name: str) -> float:
+    def balance(self, name: str) -> float:
         return self._own[name] + max(self._common, 0.0)
 
     def take(self, name: str, amount: float) -> None:
@@ -132,7 +132,7 @@ class SharedRateLimit:
     def held(self) -> bool:
         return bool(self._shares)
 
-    def paid(self, now: float) -> bool:
+    def is_paid(self, now: float) -> bool:
         """Return whether everything used has been refilled, so that a new limit would not differ."""
         self.fill(now)
         return self.messages.full and self.bytes.full
@@ -166,8 +166,8 @@ class RateAllowance:
         flow, most = self._flow, batch.messages
         flow.fill(now)
         if flow.messages.rate:
-            most = min(most, max(0, ceil(flow.messages.left(self._name))))
-        return batch.within(flow.bytes.left(self._name), most) if flow.bytes.rate else most
+            most = min(most, max(0, ceil(flow.messages.balance(self._name))))
+        return batch.within(flow.bytes.balance(self._name), most) if flow.bytes.rate else most
 
     def cut(self, batch: Batch, now: float, dropped: Callable[[int, int], None]) -> Batch:
         """Return the messages that may pass now; `dropped` gets the number of the others, and their bytes."""
@@ -212,7 +212,7 @@ class RateLimits:
             return
         now = self._clock()
         unheld = [names for names, flow in self.flows.items() if not flow.held]
-        owing = [names for names in unheld if not self.flows[names].paid(now)]
+        owing = [names for names in unheld if not self.flows[names].is_paid(now)]
         for names in set(unheld).difference(owing[-_MAX_OWING:]):
             del self.flows[names]
         self._most = max(_FEW_FLOWS, 2 * len(self.flows))

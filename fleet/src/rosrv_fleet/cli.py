@@ -145,7 +145,7 @@ def renew_robot(
     Example: rosrv-fleet robot renew arm7 --certificate arm7-2027.pem
     """
     robots, invitations = _robots(config)
-    robots.named(name)
+    robots.require(name)
     invitations.withdraw(name)  # first: otherwise the robot could join in between
     robot = robots.renew(name, certificate.read_bytes(), appliance)
     own = robot.appliances[appliance or robot.appliance]
@@ -161,7 +161,7 @@ def remove_robot(name: Name, appliance: OfPair = "", config: Config = DEFAULT_CO
     Example: rosrv-fleet robot remove arm7
     """
     robots, invitations = _robots(config)
-    robots.named(name)
+    robots.require(name)
     invitations.withdraw(name)  # first: otherwise the robot could join in between
     robots.remove(name, appliance)
     typer.echo(f"{name}{f' ({appliance})' if appliance else ''} may connect no more; its segments stay")
@@ -345,7 +345,7 @@ def verify(
     """
     found = load_config(config)
     robots = Robots(found.data / "robots")
-    chosen = list(robots.known().values()) if robot is None else [robots.named(robot)]
+    chosen = list(robots.known().values()) if robot is None else [robots.require(robot)]
     store = SegmentStore(found.data, found.limits.reserve_bytes)
     complete = robot is not None or not robots.unreadable
     for one in chosen:

@@ -150,7 +150,7 @@ def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
     )  # fmt: skip
 
 
-def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
+def renew(robot: Robot, appliance: str, certificate: str) -> Robot:
     """Return the robot with a new certificate of an appliance, which may connect again if the robot was removed."""
     before = robot.appliances[appliance]
     if before.removed not in (None, robot.removed, robot.withdrawn):
@@ -182,7 +182,7 @@ def without_appliance(robot: Robot, appliance: str) -> Robot:
     )
 
 
-def moved(robot: Robot, group: str) -> Robot:
+def move(robot: Robot, group: str) -> Robot:
     return msgspec.structs.replace(robot, group=str(RobotGroup.parse(group)))
 
 

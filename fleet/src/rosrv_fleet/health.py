@@ -47,7 +47,7 @@ class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
 def health_of(collector: Collector) -> FleetHealth:
     store = collector.store
     marked = {
-        kind: {robot: len(store.marked(kind, robot, _MAX_MARKS)) for robot in store.robots_with(kind)}
+        kind: {robot: len(store.marks(kind, robot, _MAX_MARKS)) for robot in store.robots_with(kind)}
         for kind in ("gaps", "forks")
     }
     robots = [

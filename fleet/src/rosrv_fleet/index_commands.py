@@ -29,7 +29,7 @@ from appliance.formats.machine_report import (
     Period,
     Reading,
     ReportedLog,
-    merged,
+    merge,
     read_records,
 )
 from appliance.formats.report_words import host_words, page, report_lines
@@ -166,7 +166,7 @@ def _history(robot: str, rows: Iterable[Row]) -> Iterator[NamedEntry]:
     logs: dict[str, list[LogEntry]] = {}
     for _robot, log, *columns in rows:
         logs.setdefault(log, []).append(stored_entry(StoredColumns._make(columns)))
-    return (NamedEntry(robot, entry) for _log, entry in merged(logs))
+    return (NamedEntry(robot, entry) for _log, entry in merge(logs))
 
 
 def _reported(logs: Iterable[CollectedLog]) -> list[ReportedLog]:

@@ -73,7 +73,7 @@ class Indexer:
         return (self._damage if is_damaged else self._locks) or None
 
     def _is_damaged(self, robot: str) -> bool:
-        return bool(self._store.marked("damaged", robot, 1))
+        return bool(self._store.marks("damaged", robot, 1))
 
     def wake(self) -> None:
         for waking in self._wake.values():
@@ -124,7 +124,7 @@ class Indexer:
         for robot in waiting:
             if robot not in robots and robot in self._robots.unreadable:
                 continue
-            for place in self._store.marked(lane, robot, 1):
+            for place in self._store.marks(lane, robot, 1):
                 if self._ending.is_set():
                     return False
                 found = True
@@ -162,7 +162,7 @@ class Indexer:
         except Exception as error:  # noqa: BLE001  a defect, or no memory, must not delay other segments
             self._set_aside(place, stamp, failure_of(error))
         else:
-            self._store.indexed(place)
+            self._store.mark_indexed(place)
             self._killed.pop(place, None)
 
     def _set_aside(self, place: SegmentPlace, stamp: FileStamp | None, reason: str) -> None:
@@ -207,7 +207,7 @@ def index(
 
     Raise `psycopg.Error`; for an unreadable segment `OSError`, `EOFError`, `zlib.error` or `SegmentError`.
     """
-    received = store.received(place)
+    received = store.arrival_time(place)
     day = datetime.fromtimestamp(received // _SECOND, UTC).date()
     if oldest is not None and day < oldest:
         return False

@@ -18,7 +18,7 @@ from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.signing.bearer_secrets import hash_of, new_secret
 from rosrv_fleet.enrolment import EnrolmentError
-from rosrv_fleet.robots import changing, recorded
+from rosrv_fleet.robots import changing, record_act
 
 _TOKEN = re.compile("rosrv-join_[A-Za-z0-9_-]{43}")
 
@@ -56,7 +56,7 @@ class Invitations:
         """Make an invitation, which replaces earlier ones of the same appliance, and return it with its token."""
         pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds, appliance=appliance)
         token = f"rosrv-join_{new_secret()}"
-        with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
+        with changing(self._folder), record_act(self._folder.parent, "robot invite", name, group):
             self._remove(name, appliance)
             self._keep(token, pending)
         return pending, token
@@ -66,7 +66,7 @@ class Invitations:
         with changing(self._folder):
             kept = map(_read, self._folder.glob("*.json"))
             if any(pending is not None and pending.name == name for pending in kept):
-                with recorded(self._folder.parent, "invitation withdraw", name):
+                with record_act(self._folder.parent, "invitation withdraw", name):
                     self._remove(name)
 
     def _remove(self, name: str, appliance: str | None = None) -> None:

@@ -21,7 +21,7 @@ Json = Annotated[bool, typer.Option("--json", metavar="", help="One JSON object 
 def duration(shortest: str, longest: str) -> Callable[[str | float], float]:
     """Return a parser of seconds."""
 
-    def parsed(given: str | float) -> float:
+    def parse(given: str | float) -> float:
         if isinstance(given, float):  # typer also converts the default
             return given
         try:
@@ -29,4 +29,4 @@ def duration(shortest: str, longest: str) -> Callable[[str | float], float]:
         except ValueError as error:
             raise typer.BadParameter(str(error)) from None
 
-    return parsed
+    return parse

@@ -102,7 +102,7 @@ def push_router(collector: Collector) -> APIRouter:
         if idle or off:
             heard(request, robot, off=off)
         found = collector.store.head(robot.name, log, upto)
-        same = [] if found is None else collector.store.numbered(robot.name, log, found.number)
+        same = [] if found is None else collector.store.with_number(robot.name, log, found.number)
         hashes = [checkpoint_hash(header.end.text()) for header in collector.store.headers(same)]
         fields = {"robot": robot.name, "log": log, "number": found.number if found else 0, "hashes": hashes}
         return Response(msgspec.json.encode(fields), media_type="application/json")
@@ -255,4 +255,4 @@ class _Uploads:
         return SegmentReceipt(
             robot=place.robot, log=place.log, number=place.number, segment=place.name, first=first, last=last,
             time=clock.wall_ns(),
-        ).signed(self._collector.receipt_key)  # fmt: skip
+        ).sign(self._collector.receipt_key)  # fmt: skip

@@ -29,10 +29,10 @@ from rosrv_fleet.enrolment import (
     RobotGroup,
     check_name,
     check_stored,
-    moved,
+    move,
     new_appliance,
     new_robot,
-    renewed,
+    renew,
     valid_certificate,
     with_appliance,
     without_appliance,
@@ -47,7 +47,7 @@ FILE = "acts.ndjson"
 
 
 @contextmanager
-def recorded(data: Path, act: str, about: str, detail: str = "", who: str = "") -> Iterator[None]:
+def record_act(data: Path, act: str, about: str, detail: str = "", who: str = "") -> Iterator[None]:
     """Record an act around the block that carries it out.
 
     `who` defaults to this command's user, or the user who called sudo. If the act cannot be recorded, raise `OSError`
@@ -197,18 +197,18 @@ class Robots:
 
     def renew(self, name: str, certificate: bytes, appliance: str = "") -> Robot:
         with changing(self.folder):
-            known = self.named(name)
+            known = self.require(name)
             own = appliance or (known.appliance if len(known.connecting) < 2 else "")
             if own not in known.appliances:
                 raise EnrolmentError(
                     f"{name} has no appliance {own!a}: use --appliance {' or '.join(known.connecting)}"
                 )
-            robot = self._unique(renewed(known, own, valid_certificate(certificate)))
+            robot = self._unique(renew(known, own, valid_certificate(certificate)))
             return self._keep(robot, "robot renew", _detail(robot, own))
 
     def move(self, name: str, group: str) -> Robot:
         with changing(self.folder):
-            return self._keep(moved(self.named(name), group), "robot group", group)
+            return self._keep(move(self.require(name), group), "robot group", group)
 
     def join(
         self,
@@ -234,13 +234,13 @@ class Robots:
     def remove(self, name: str, appliance: str = "") -> None:
         """Reject the connections of a robot, or of one of its two appliances. Its segments stay."""
         with changing(self.folder):
-            known = self.named(name)
+            known = self.require(name)
             if appliance:
                 self._keep(without_appliance(known, appliance), "robot remove", f"appliance {appliance}")
             else:
                 self._keep(msgspec.structs.replace(known, removed=clock.wall_ns()), "robot remove")
 
-    def named(self, name: str) -> Robot:
+    def require(self, name: str) -> Robot:
         robot = self.known().get(name)
         if robot is None:
             if name in self.unreadable:
@@ -261,7 +261,7 @@ class Robots:
             return self._unique(new_robot(name, made, group, appliance or FIRST)), appliance or FIRST
         own = next((one for one, found in known.appliances.items() if found.key == made.key), None)
         if own is not None:
-            robot = renewed(known, own, made.certificate)
+            robot = renew(known, own, made.certificate)
         elif (appliance or FIRST) in known.appliances:
             raise EnrolmentError(
                 f"{name} is enrolled with another log key, which its segments need: invite this robot under a new"
@@ -269,7 +269,7 @@ class Robots:
             )
         else:
             robot = with_appliance(known, appliance or FIRST, made)
-        return self._unique(moved(robot, group) if group else robot), own or appliance or FIRST
+        return self._unique(move(robot, group) if group else robot), own or appliance or FIRST
 
     def _unique(self, robot: Robot) -> Robot:
         """Return the robot. Raise `EnrolmentError` if another one has its certificate or key, or is unreadable."""
@@ -285,7 +285,7 @@ class Robots:
         return robot
 
     def _keep(self, robot: Robot, act: str, detail: str = "") -> Robot:
-        with recorded(self.folder.parent, act, robot.name, detail):
+        with record_act(self.folder.parent, act, robot.name, detail):
             write_whole(self.folder / f"{robot.name}.json", msgspec.json.encode(robot), 0o600)
         with self._lock:
             self._seen = -1

@@ -231,7 +231,7 @@ class SegmentStore:
                 " an older copy, begin a new log: stop its appliance, move control/audit.db* of its state directory"
                 " away, and start it"
             )
-        if len(self.numbered(place.robot, place.log, place.number)) >= _MAX_FORKS:
+        if len(self.with_number(place.robot, place.log, place.number)) >= _MAX_FORKS:
             raise NotStorableError(f"{_MAX_FORKS} segments have the number {place.number}")
         bucket = self.path(place).parent
         for folder, most, what in ((bucket, _MAX_BUCKETS, "ranges"), (bucket.parent, _MAX_LOGS, "logs")):
@@ -285,12 +285,12 @@ class SegmentStore:
         with self._lock(place.robot):
             self._settle(place, header)
             newest = self.newest(place.robot)
-            if newest is None or newest[0] < self.received(place):
+            if newest is None or newest[0] < self.arrival_time(place):
                 self._note_newest(place)
 
     def _settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
         sync(self.path(place).parent)
-        for following in self.numbered(place.robot, place.log, place.number + 1):
+        for following in self.with_number(place.robot, place.log, place.number + 1):
             found = self._readable(following)
             if found is not None and found.follows(header):
                 self._unmark("gaps", following)
@@ -304,7 +304,7 @@ class SegmentStore:
     def _mark(self, place: SegmentPlace, header: SegmentHeader, waiting: str) -> None:
         if not self._follows_a_stored_one(place, header):
             self._touch("gaps", place)
-        others = self.numbered(place.robot, place.log, place.number)
+        others = self.with_number(place.robot, place.log, place.number)
         for one in [*others, place] if others else []:
             self._touch("forks", one)
         self._touch(waiting, place)
@@ -337,12 +337,12 @@ class SegmentStore:
             return True
         note = self.removal(place.robot, place.log)
         ends = note.ends if note is not None and note.number == place.number - 1 else []
-        before = self.numbered(place.robot, place.log, place.number - 1)
+        before = self.with_number(place.robot, place.log, place.number - 1)
         return any(map(header.follows, ends)) or any(
             found is None or header.follows(found) for found in map(self._readable, before)
         )
 
-    def numbered(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
+    def with_number(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
         """Return the segments with a number: at most one, unless the robot signed two histories."""
         bucket = self.path(SegmentPlace(robot, log, number, "")).parent
         return [one for one in _in_bucket(robot, log, bucket) if one.number == number]
@@ -364,11 +364,11 @@ class SegmentStore:
         for bucket in _folders(self._folder / "segments" / robot / log):
             yield from _in_bucket(robot, log, bucket)
 
-    def received(self, place: SegmentPlace) -> int:
+    def arrival_time(self, place: SegmentPlace) -> int:
         """Return the time of arrival in nanoseconds since the epoch."""
         return self.path(place).stat().st_mtime_ns
 
-    def marked(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
+    def marks(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
         found = []
         with contextlib.suppress(FileNotFoundError), os.scandir(self._folder / kind / robot) as entries:
             for entry in entries:
@@ -386,7 +386,7 @@ class SegmentStore:
         found = set[SegmentPlace]()  # those that are tried again have two markers
         for kind in ("pending", "large", "damaged"):
             for robot in self.robots_with(kind):
-                found.update(self.marked(kind, robot, most))
+                found.update(self.marks(kind, robot, most))
                 if len(found) >= most:
                     return most
         return len(found)
@@ -403,7 +403,7 @@ class SegmentStore:
             for one in self.segments(robot.name, log)
         )
 
-    def indexed(self, place: SegmentPlace) -> None:
+    def mark_indexed(self, place: SegmentPlace) -> None:
         for kind in ("pending", "large", "damaged"):
             self._unmark(kind, place)
 
@@ -427,14 +427,14 @@ class SegmentStore:
     def try_again(self) -> None:
         """Let the damaged segments wait for the index again. They stay marked as damaged."""
         for robot in self.robots_with("damaged"):
-            for place in self.marked("damaged", robot, sys.maxsize):
+            for place in self.marks("damaged", robot, sys.maxsize):
                 self._touch("large", place)
 
     def forget_absent(self, place: SegmentPlace) -> None:
         """Remove the index's markers of a segment if a crash came before it was stored. The robot pushes it again."""
         with self._lock(place.robot):  # `keep` writes the marker before the segment
             if not self.path(place).exists():
-                self.indexed(place)
+                self.mark_indexed(place)
 
     def removal(self, robot: str, log: str) -> RemovalNote | None:
         try:
@@ -481,7 +481,7 @@ class SegmentStore:
         last = 0
         for place in self.segments(robot, log):
             waits = any((self._folder / kind / robot / place.mark).exists() for kind in ("pending", "large"))
-            arrived = self.received(place)
+            arrived = self.arrival_time(place)
             if head is None or place.number >= head.number or waits or before <= arrived <= now:
                 last = min(last, place.number - 1)
                 break

@@ -10,7 +10,7 @@ import msgspec
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.signing.bearer_secrets import hash_of, new_secret
-from rosrv_fleet.robots import changing, recorded
+from rosrv_fleet.robots import changing, record_act
 from rosrv_fleet.segment_store import read_stored
 
 _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
@@ -70,7 +70,7 @@ class OperatorTokens:
                 raise TokenError(
                     f"{name} already has a token; remove it first: rosrv-fleet token remove {name}"
                 )
-            with recorded(self._file.parent, "token add", name, role):
+            with record_act(self._file.parent, "token add", name, role):
                 self._write([*tokens, made])
         return text
 
@@ -80,7 +80,7 @@ class OperatorTokens:
             left = [token for token in tokens if token.name != name]
             if len(left) == len(tokens):
                 raise TokenError(f"{name!a} has no token; list them: rosrv-fleet token list")
-            with recorded(self._file.parent, "token remove", name):
+            with record_act(self._file.parent, "token remove", name):
                 self._write(left)
 
     def _write(self, tokens: list[OperatorToken]) -> None:

@@ -198,7 +198,7 @@ class FleetRobot:
     def _sign(self, number: int, text: bytes, *, oldest: bool) -> None:
         log = getattr(self, "log", None)
         if log is not None:
-            log.signed(number, self.key.sign(text), self.public)
+            log.store_signature(number, self.key.sign(text), self.public)
 
     def record(self, count: int, **changes: Any) -> None:
         for number in range(count):

@@ -185,7 +185,7 @@ def test_a_day_that_is_dropped_while_its_segment_is_indexed(
     monkeypatch.setattr(indexer, "make_partition", midnight)
     (log,) = collector.store.logs("arm1")
     (place,) = collector.store.segments("arm1", log)
-    today = datetime.fromtimestamp(collector.store.received(place) // 10**9, UTC).date()
+    today = datetime.fromtimestamp(collector.store.arrival_time(place) // 10**9, UTC).date()
 
     def indexed(database: IndexDatabase, oldest: date) -> bool:
         return index(database, collector.store, place, (robot.public,), collector.config, oldest=oldest)

@@ -57,7 +57,7 @@ def _started(folder: Path) -> Collector:
 
 
 def _push(collector: Collector, number: int) -> None:
-    collector.store.indexed(upload(collector.store, number))
+    collector.store.mark_indexed(upload(collector.store, number))
 
 
 def _kept(collector: Collector) -> list[int]:

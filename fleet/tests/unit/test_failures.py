@@ -72,7 +72,7 @@ def test_a_segment_that_causes_a_defect_is_set_aside(tmp_path: Path) -> None:
         FleetConfig(certificate=tmp_path, key=tmp_path),
     )
     assert [work.step(lane) for lane in LANES] == [True, False]
-    assert (store.marked("pending", "arm1", 9), store.marked("damaged", "arm1", 9)) == ([], [place])
+    assert (store.marks("pending", "arm1", 9), store.marks("damaged", "arm1", 9)) == ([], [place])
     assert work.trouble is not None
     assert "a defect of rosrv-fleet, please report it: MemoryError" in work.trouble
 

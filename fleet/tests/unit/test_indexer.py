@@ -35,8 +35,8 @@ def test_segments_wait_while_no_worker_can_be_started(store: SegmentStore, tmp_p
     enrolled_robots(tmp_path, "arm1")
     with pytest.raises(BlockingIOError):
         _indexer(store, tmp_path).step("pending")
-    assert store.marked("pending", "arm1", 9) == [_PLACE]
-    assert store.marked("damaged", "arm1", 9) == []
+    assert store.marks("pending", "arm1", 9) == [_PLACE]
+    assert store.marks("damaged", "arm1", 9) == []
 
 
 def test_segments_wait_while_the_file_of_their_robot_is_damaged(store: SegmentStore, tmp_path: Path) -> None:
@@ -49,8 +49,8 @@ def test_segments_wait_while_the_file_of_their_robot_is_damaged(store: SegmentSt
     (tmp_path / "pending" / "arm2" / other.mark).touch()
     with pytest.raises(BlockingIOError):
         indexer.step("pending")
-    assert store.marked("pending", "arm1", 9) == [_PLACE]
-    assert store.marked("damaged", "arm1", 9) == []
+    assert store.marks("pending", "arm1", 9) == [_PLACE]
+    assert store.marks("damaged", "arm1", 9) == []
 
 
 def test_a_segment_that_was_replaced_is_indexed_again(store: SegmentStore, tmp_path: Path) -> None:
@@ -65,21 +65,21 @@ def test_a_segment_that_was_replaced_is_indexed_again(store: SegmentStore, tmp_p
     )
     indexer = _indexer(store, tmp_path, workers)
     assert indexer.step("pending")
-    assert store.marked("pending", "arm1", 9) == [_PLACE]
-    assert store.marked("damaged", "arm1", 9) == []
+    assert store.marks("pending", "arm1", 9) == [_PLACE]
+    assert store.marks("damaged", "arm1", 9) == []
     assert indexer.step("pending")
-    assert store.marked("pending", "arm1", 9) == []
-    assert store.marked("damaged", "arm1", 9) == [_PLACE]
+    assert store.marks("pending", "arm1", 9) == []
+    assert store.marks("damaged", "arm1", 9) == [_PLACE]
 
 
 def test_a_segment_that_is_tried_again_stays_reported(store: SegmentStore, tmp_path: Path) -> None:
     indexer = _indexer(store, tmp_path)
     for lane in ("pending", "large"):
         assert indexer.step(lane)
-        assert store.marked(lane, "arm1", 9) == []
-        assert store.marked("damaged", "arm1", 9) == [_PLACE]
+        assert store.marks(lane, "arm1", 9) == []
+        assert store.marks("damaged", "arm1", 9) == [_PLACE]
         store.try_again()
-        assert store.marked("large", "arm1", 9) == store.marked("damaged", "arm1", 9) == [_PLACE]
+        assert store.marks("large", "arm1", 9) == store.marks("damaged", "arm1", 9) == [_PLACE]
         assert store.waiting(9) == 1
-    store.indexed(_PLACE)
+    store.mark_indexed(_PLACE)
     assert store.waiting(9) == 0

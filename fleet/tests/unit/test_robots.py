@@ -349,7 +349,7 @@ def test_a_damaged_file_affects_no_other_robot(word: str, damaged: str, tmp_path
         robots.renew("arm2", make_own_certificate("arm2", 1)[1])
     before["arm2"] = robots.move("arm2", "site-a/arms")
     with pytest.raises(EnrolmentError, match="repair it"):
-        Robots(tmp_path / "robots").named("arm1")
+        Robots(tmp_path / "robots").require("arm1")
     file.write_text(whole)
     with using(VirtualClock(now=now() + 2)):  # it reads the folder again after a second
         assert robots.known() == before

@@ -9,14 +9,14 @@ from rosrv_fleet.rollouts.machine import (
     HealthGates,
     RobotSeen,
     RolloutState,
-    advanced,
+    advance,
     counts,
     fault_of_rings,
-    resumed,
-    reverted,
+    resume,
+    revert,
     ring_of,
-    selected,
-    stopped,
+    stop,
+    target,
 )
 from rosrv_fleet.rollouts.service import conditions
 
@@ -64,7 +64,7 @@ def test_the_invariants_hold_for_all_reports(
             robots[robot] = RobotSeen(
                 now - ago, seen.in_force, "", seen.refused, "", False, seen.denials, seen.failing
             )
-        before, rollout = rollout, advanced(rollout, robots, now)
+        before, rollout = rollout, advance(rollout, robots, now)
         assert rollout.ring - before.ring in (0, 1)
         if rollout.ring > before.ring:
             assert now >= rollout.terms.rings[rollout.ring].after
@@ -78,7 +78,7 @@ def test_the_invariants_hold_for_all_reports(
         if rollout.state == "done":
             assert rollout.ring == len(RINGS) - 1
         for robot, seen in robots.items():
-            choice = selected(rollout, robot, seen)
+            choice = target(rollout, robot, seen)
             assert choice in (OLD, NEW)
             if choice == NEW and rollout.state != "done":
                 assert ring_of(rollout, robot) <= rollout.ring
@@ -90,8 +90,8 @@ def test_the_invariants_hold_for_all_reports(
 def test_healthy_robots_finish_a_rollout() -> None:
     rollout, now = begun(), 0.0
     while rollout.state == "running" and now < 10_000:
-        robots = {robot: RobotSeen(now, selected(rollout, robot, None)) for robot in ROBOTS}
-        rollout, now = advanced(rollout, robots, now), now + 10
+        robots = {robot: RobotSeen(now, target(rollout, robot, None)) for robot in ROBOTS}
+        rollout, now = advance(rollout, robots, now), now + 10
     assert rollout.state == "done"
     assert 200 <= now <= 400
 
@@ -108,16 +108,16 @@ def test_healthy_robots_finish_a_rollout() -> None:
 )
 def test_a_bad_canary_stops(sick: RobotSeen, word: str) -> None:
     known = {robot: RobotSeen(0, OLD, denials=4) for robot in ROBOTS}
-    rollout = advanced(begun(), known, 0)
+    rollout = advance(begun(), known, 0)
     assert rollout.ring == 0
     robots = all_at(60) | {"r1": sick}
-    rollout = advanced(rollout, robots, 60)
+    rollout = advance(rollout, robots, 60)
     assert rollout.state == "stopped"
     assert word in rollout.why
-    assert selected(rollout, "r0", robots["r0"]) == NEW  # in force there: it stays
-    assert selected(rollout, "r0", RobotSeen(60, OLD)) == OLD
-    assert selected(rollout, "r5", robots["r5"]) == OLD
-    assert selected(reverted(rollout, ""), "r0", robots["r0"]) == OLD
+    assert target(rollout, "r0", robots["r0"]) == NEW  # in force there: it stays
+    assert target(rollout, "r0", RobotSeen(60, OLD)) == OLD
+    assert target(rollout, "r5", robots["r5"]) == OLD
+    assert target(revert(rollout, ""), "r0", robots["r0"]) == OLD
 
 
 @pytest.mark.parametrize(
@@ -130,22 +130,22 @@ def test_a_robot_keeps_the_bundle_of_an_earlier_stopped_rollout_until_its_ring_o
 ) -> None:
     rollout = msgspec.structs.replace(begun(), kept=[KEPT], ring=0, state=state)
     wanted = NEW if (robot, state) == ("r0", "running") else expected
-    assert selected(rollout, robot, RobotSeen(1, in_force)) == wanted
-    assert selected(reverted(rollout, ""), robot, RobotSeen(1, in_force)) == OLD
+    assert target(rollout, robot, RobotSeen(1, in_force)) == wanted
+    assert target(revert(rollout, ""), robot, RobotSeen(1, in_force)) == OLD
 
 
 def test_more_denials_of_the_old_bundle_do_not_stop() -> None:
-    rollout = advanced(begun(), all_at(0, OLD), 0)
+    rollout = advance(begun(), all_at(0, OLD), 0)
     robots = all_at(60, OLD) | {"r0": RobotSeen(60, OLD, denials=90, failing=3)}
-    assert advanced(rollout, robots, 60).state == "running"
+    assert advance(rollout, robots, 60).state == "running"
 
 
 def test_robots_that_were_off_do_not_count() -> None:
     robots = all_at(0) | {"r1": RobotSeen(-5000, OLD)}
-    rollout = advanced(begun(), robots, 0)
+    rollout = advance(begun(), robots, 0)
     for now in (10.0, 70.0, 130.0):
         robots = all_at(now) | {"r1": RobotSeen(-5000, OLD)}
-        rollout = advanced(rollout, robots, now)
+        rollout = advance(rollout, robots, now)
     assert rollout.state == "running"
     assert rollout.ring >= 1
 
@@ -156,10 +156,10 @@ def test_no_ring_passes_that_no_robot_was_judged_of(comes: list[int]) -> None:
     rollout, robots = begun(), dict[str, RobotSeen]()
     for now in range(1, 3000, 20):
         robots = {
-            robot: RobotSeen(now, selected(rollout, robot, None)) if now >= begins else RobotSeen(-5000, OLD)
+            robot: RobotSeen(now, target(rollout, robot, None)) if now >= begins else RobotSeen(-5000, OLD)
             for robot, begins in began.items()
         }
-        rollout = advanced(rollout, robots, now)
+        rollout = advance(rollout, robots, now)
         if rollout.state != "running":
             break
     taken = sum(seen.in_force == NEW for seen in robots.values())
@@ -180,32 +180,32 @@ def test_refusals_of_robots_that_were_off_when_their_ring_opened_count(
 ) -> None:
     gates = msgspec.structs.replace(GATES, tolerance=0.1)
     one = Terms(0, [Ring("all", [], 100)])
-    rollout = advanced(
+    rollout = advance(
         begun(one, gates), {robot: RobotSeen(-5000, OLD) for robot in ROBOTS} | all_at(0, OLD, 1), 0
     )
     assert list(rollout.baselines) == ["r0"]
     robots = all_at(60) | {robot: RobotSeen(60, OLD, "", NEW) for robot in refusing}
-    assert advanced(rollout, robots, 60).state == state
-    assert advanced(rollout, robots | {"r0": RobotSeen(60, NEW, failing=1)}, 60).state == "stopped"
+    assert advance(rollout, robots, 60).state == state
+    assert advance(rollout, robots | {"r0": RobotSeen(60, NEW, failing=1)}, 60).state == "stopped"
 
 
 def test_a_ring_that_is_not_taken_stops_after_its_time() -> None:
-    rollout = advanced(begun(), all_at(0, OLD), 0)
-    assert advanced(rollout, all_at(900, OLD), 900).state == "running"
-    late = advanced(rollout, all_at(1001, OLD), 1001)
+    rollout = advance(begun(), all_at(0, OLD), 0)
+    assert advance(rollout, all_at(900, OLD), 900).state == "running"
+    late = advance(rollout, all_at(1001, OLD), 1001)
     assert late.state == "stopped"
     assert "0 of 2 robots of ring canary" in late.why
 
 
 def test_a_canary_ring_without_robots_stops_after_its_time() -> None:
     robots = {"r9": RobotSeen(0, OLD)}
-    rollout = advanced(begun(), robots, 0)
+    rollout = advance(begun(), robots, 0)
     assert rollout.ring == -1
     assert "ring canary has no robot that reports" in rollout.why
-    assert stopped(rollout, "by hand").state == "stopped"
-    assert advanced(rollout, robots, 1000).state == "running"
-    assert advanced(rollout, robots, 1001).state == "stopped"
-    assert advanced(resumed(rollout, 5000), robots, 6000).state == "running"
+    assert stop(rollout, "by hand").state == "stopped"
+    assert advance(rollout, robots, 1000).state == "running"
+    assert advance(rollout, robots, 1001).state == "stopped"
+    assert advance(resume(rollout, 5000), robots, 6000).state == "running"
 
 
 @pytest.mark.parametrize(
@@ -228,23 +228,23 @@ def test_rings_fit_the_enrolled_robots(rings: list[Ring], fault: str) -> None:
 
 
 def test_a_removed_robot_counts_no_more() -> None:
-    rollout = advanced(begun(), all_at(0), 0)
+    rollout = advance(begun(), all_at(0), 0)
     robots = all_at(10)
     del robots["r1"]
-    assert advanced(rollout, robots, 10).why == "healthy"
+    assert advance(rollout, robots, 10).why == "healthy"
     del robots["r0"]
-    late = advanced(rollout, robots, 10)
+    late = advance(rollout, robots, 10)
     assert late.state == "stopped"
     assert "no robot of ring canary is enrolled" in late.why
 
 
 def test_a_time_without_a_collector_counts_for_no_gate() -> None:
-    rollout = advanced(advanced(begun(), all_at(0), 0), all_at(1), 1)
+    rollout = advance(advance(begun(), all_at(0), 0), all_at(1), 1)
     assert rollout.healthy == 1
-    later = resumed(rollout, 5000)
-    assert advanced(later, all_at(5001), 5001).ring == 0
-    assert advanced(later, all_at(5001, OLD), 5001).state == "running"
-    assert advanced(rollout, all_at(5001, OLD), 5001).state == "stopped"
+    later = resume(rollout, 5000)
+    assert advance(later, all_at(5001), 5001).ring == 0
+    assert advance(later, all_at(5001, OLD), 5001).state == "running"
+    assert advance(rollout, all_at(5001, OLD), 5001).state == "stopped"
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_a_time_without_a_collector_counts_for_no_gate() -> None:
     ],
 )
 def test_the_condition_is_the_worst_that_applies(seen: RobotSeen, kind: str, why: str) -> None:
-    rollout = advanced(begun(), all_at(0), 0)
+    rollout = advance(begun(), all_at(0), 0)
     found = conditions(rollout, all_at(1000) | {"r0": seen}, 1000)["r0"]
     assert found.kind == kind
     assert why in found.why
@@ -282,5 +282,5 @@ def test_without_a_rollout_a_robot_is_not_behind() -> None:
     ],
 )
 def test_after_a_revert_the_conditions_are_about_the_bundle_before(seen: RobotSeen, kind: str) -> None:
-    rollout = reverted(advanced(begun(), all_at(0), 0), "reverted by olga")
+    rollout = revert(advance(begun(), all_at(0), 0), "reverted by olga")
     assert conditions(rollout, all_at(1000) | {"r0": seen}, 1000)["r0"].kind == kind

@@ -33,7 +33,7 @@ def test_a_repeated_upload_completes_the_work_of_a_killed_collector(
         upload(store, 3)
     monkeypatch.undo()
     assert newest(store) == 2
-    found = store.numbered("arm7", _LOG, 3)[0]
+    found = store.with_number("arm7", _LOG, 3)[0]
     let_time_pass(10)
     store.settle(found, store.header(found))
     assert newest(store) == 3

@@ -78,7 +78,7 @@ def test_each_act_and_another_value_of_each_parameter_happen_in_the_worlds_of_ea
     kind, chosen = WORLDS[preset], set[tuple[str, str]]()
     monkeypatch.setattr(
         kind,
-        "guarded",
+        "guard_with",
         lambda _world, values, *_types: chosen.update(
             (name, _text(value)) for name, value in values.items() if name in parameters_of(preset)
         ),

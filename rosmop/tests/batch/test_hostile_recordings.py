@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 
 from rosmop.batch import jobs
 from rosmop.batch.executor import ThisProcess
-from rosmop.batch.jobs import Failure, Survey, SurveyJob, packed, unpacked, work
+from rosmop.batch.jobs import Failure, Survey, SurveyJob, to_bytes, unpack, work
 from rosmop.batch.journal import JournalError, ResumeJournal
 from rosmop.batch.recording_list import recordings_of
 from rosmop.batch.runner import JobRunner
@@ -125,7 +125,7 @@ def test_a_recording_that_changes_fails(folder: Path) -> None:
         file.write(b"\0")
     Path("bags/0.bag").touch()
     for recording in (first, second):
-        result = unpacked(work(packed(SurveyJob(recording, ["*"]))))
+        result = unpack(work(to_bytes(SurveyJob(recording, ["*"]))))
         assert isinstance(result, Failure)
         assert result.text == f"{recording.uri} changed after the command began"
 
@@ -249,7 +249,7 @@ def test_bytes_outside_utf8_in_a_connection_leave_its_recording(field: str, tmp_
     status, out, err = rosmop(f"run {specification} --bag {tmp_path}/odd.bag --output {tmp_path}/out.bag")
     assert (status, out.splitlines()[-1].partition(":")[0], err) == (0, "10 messages", "")
     (recording,) = recordings_of([], [f"{tmp_path}/odd.bag"])
-    survey = unpacked(work(packed(SurveyJob(recording, ["*"]))))
+    survey = unpack(work(to_bytes(SurveyJob(recording, ["*"]))))
     assert isinstance(survey, Survey) and survey.topics["/n"] == KIND
 
 

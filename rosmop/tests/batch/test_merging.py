@@ -6,7 +6,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosmop.batch.jobs import unpacked
+from rosmop.batch.jobs import unpack
 from rosmop.learn.learner import learn
 from rosmop.learn.passes import (
     AlarmFacts,
@@ -57,7 +57,7 @@ def recorded(number: int, rows: list[tuple[tuple[str, bytes], int]]) -> Recorded
 
 
 def through_bytes(facts: Facts) -> Facts:
-    result = unpacked(msgspec.msgpack.encode(facts))
+    result = unpack(msgspec.msgpack.encode(facts))
     assert isinstance(result, TimeFacts | ContentFacts | AlarmFacts)
     assert result == facts
     return result
@@ -66,7 +66,7 @@ def through_bytes(facts: Facts) -> Facts:
 def merged(facts: list[Facts], chance: random.Random) -> Facts:
     while len(facts) > 1:
         one, other = (facts.pop(chance.randrange(len(facts))) for _ in range(2))
-        facts.append(one.merged(other))  # type: ignore[arg-type] # facts of one kind
+        facts.append(one.merge(other))  # type: ignore[arg-type] # facts of one kind
     return facts[0]
 
 

@@ -81,25 +81,25 @@ def walks(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
     while code[at] != 10:
         reader = _Reader(code)
         reader.at = at + 1
-        size = reader.unsigned()
+        size = reader.read_unsigned()
         at = reader.at + size
     section = at
     reader = _Reader(code)
     reader.at = at + 1
-    reader.unsigned()
+    reader.read_unsigned()
     end_of_size = reader.at
-    count = reader.unsigned()
+    count = reader.read_unsigned()
     bodies = []
     head = code[end_of_size : reader.at]
     for _ in range(count):
-        size = reader.unsigned()
+        size = reader.read_unsigned()
         bodies.append(reader.take(size))
     rest = code[reader.at :]
     number = module.functions
     inner = _Reader(bodies[number])
     kinds = list(decoding.functions_of(code)[number].parameters)
-    for _ in range(inner.unsigned()):
-        many = inner.unsigned()
+    for _ in range(inner.read_unsigned()):
+        many = inner.read_unsigned()
         kinds += [decoding.TYPES[inner.byte()]] * many
     inner.block()
     for begin, end, one in inner.found:
@@ -117,13 +117,13 @@ def tables(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
     reader.at = 8
     while code[reader.at] != 11:
         reader.byte()
-        reader.take(reader.unsigned())
+        reader.take(reader.read_unsigned())
     reader.byte()
-    reader.unsigned()
-    for _ in range(reader.unsigned()):
+    reader.read_unsigned()
+    for _ in range(reader.read_unsigned()):
         reader.byte()
         reader.block()
-        size = reader.unsigned()
+        size = reader.read_unsigned()
         for cell in range(reader.at, reader.at + size - 1, 2):
             (value,) = struct.unpack_from("<h", code, cell)
             made = code[:cell] + struct.pack("<h", value ^ 1) + code[cell + 2 :]

@@ -10,7 +10,7 @@ import pytest
 from rosmop.certify.steps import StepDiffersError, check_steps
 from rosmop.check.sources import compiled_from
 from rosmop.fast import batch_codegen, build
-from rosmop.fast.batch_codegen import WasmModule, written
+from rosmop.fast.batch_codegen import WasmModule, write
 from rosmop.fast.wasm_instance import WasmError
 from rosmop.form import nodes, specification_groups
 from rosmop.form.compiled import Compiled
@@ -39,7 +39,7 @@ def compiled(*texts: str) -> Compiled:
 
 
 def module(of: Compiled) -> WasmModule:
-    return written(
+    return write(
         of.functions, [group.component for group in groups(of.specifications)], ValueCodec(of.messages)
     )
 

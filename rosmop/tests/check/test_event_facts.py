@@ -6,7 +6,7 @@ import pytest
 from rosmop.check.sources import compiled_from
 from rosmop.fast.abi import MAX_KEPT
 from rosmop.fast.build import require_loadable
-from rosmop.fast.serialization import encoded
+from rosmop.fast.serialization import encode
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import message
@@ -68,7 +68,7 @@ def test_each_slice_has_ages_of_its_own() -> None:
 
 
 def test_equal_texts_with_ages_give_equal_sets() -> None:
-    data = {encoded(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)}
+    data = {encode(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)}
     [one] = data
     require_loadable(one)
 

@@ -26,7 +26,7 @@ JOINTS = message(
 
 
 def test_a_float_constant_of_a_message_is_a_float() -> None:
-    own = definitions().extended(Definitions.from_files({"own/C.msg": "float32 LIMIT=0.1\nfloat32 x\n"}))
+    own = definitions().merge(Definitions.from_files({"own/C.msg": "float32 LIMIT=0.1\nfloat32 x\n"}))
     text = event(
         "own/C", "float x", "x:x", 'ROS_INFO("%d %d", x == own::C::LIMIT, (double) own::C::LIMIT == 0.1);'
     )

@@ -92,9 +92,7 @@ def test_an_array_behind_a_large_one_and_a_string_is_not_the_array_before_them()
     pad = 2_000_000
     own = {"own/Large.msg": f"int8[{pad}] pad\nint32[2] x\nstring s\nint32[2] y\n"}
     text = "s() { event e(int a, int b) /t own/Large '{x[0]:a, y[0]:b}' { ROS_INFO(\"%d %d\", a, b); } }"
-    monitors = MonitorSet.of(
-        compiled_from({"x.rv": text}, definitions().extended(Definitions.from_files(own)))
-    )
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions().merge(Definitions.from_files(own))))
     monitors.start(0)
     data = bytes(pad) + struct.pack("<iiI3sii", 11, 12, 3, b"abc", 21, 22)
     assert [line.text for line in monitors.process("/t", data, 0).log] == ["11 21"]

@@ -9,7 +9,7 @@ import pytest
 
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import require_loadable
-from rosmop.fast.serialization import encoded
+from rosmop.fast.serialization import encode
 from rosmop.tests.both_ways import BothWays, plain
 from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import definitions
@@ -84,7 +84,7 @@ def test_a_message_may_refer_to_earlier_ones_of_its_own_topic() -> None:
 def test_the_module_takes_these_messages_and_the_text_is_loadable() -> None:
     text = f"s() {{ {EVENTS} pattern: globally: a as A forbids b {{x < @A.x}} @violation {{ }} }}"
     compiled = compiled_from({"x.rv": text}, definitions())
-    require_loadable(encoded(compiled))
+    require_loadable(encode(compiled))
     assert [warning.text for warning in compiled.warnings] == [
         f"no property uses the event `{name}`" for name in "pq"
     ]

@@ -5,7 +5,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from rosmop.form.findings import SpecificationError
-from rosmop.learn.exercised import CoverageItem, covered, items_of, merged
+from rosmop.learn.exercised import CoverageItem, add_counts, coverage, items_of
 from rosmop.recordings.recording import RecordedFile
 from rosmop.tests.acting import message
 from rosmop.tests.learn.test_learner import START, Recorded
@@ -36,7 +36,7 @@ def counted(text: str, recordings: Sequence[Recorded]) -> dict[CoverageItem, int
     items = items_of(texts)
     counts = [0] * len(items)
     for recording in recordings:
-        counts = merged(counts, covered(texts, standard_definitions(), recording))
+        counts = add_counts(counts, coverage(texts, standard_definitions(), recording))
     return dict(zip(items, counts, strict=True))
 
 
@@ -137,7 +137,7 @@ def test_a_branch_by_caller_is_counted(tmp_path: Path) -> None:
                 "/open", "std_msgs/msg/Int32", msgdef=text_and_sum[0], md5sum=text_and_sum[1], callerid=caller
             )
             bag.write(place, START + number, message("std_msgs/Int32"))
-    found = covered({"gate.rv": text}, standard_definitions(), RecordedFile(tmp_path / "a.bag", ["*"]))
+    found = coverage({"gate.rv": text}, standard_definitions(), RecordedFile(tmp_path / "a.bag", ["*"]))
     named = zip(items_of({"gate.rv": text}), found, strict=True)
     assert {item.what: count for item, count in named if item.kind == "branch"} == {"if": 1, "else": 2}
 

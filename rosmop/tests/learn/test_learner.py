@@ -225,7 +225,7 @@ def test_what_is_too_long_for_one_file_is_in_several() -> None:
 def test_names_that_ros_allows_give_a_valid_specification() -> None:
     """Fields may have words of the language, which no pattern names: they are left out, and told."""
     words = [*sorted(WORDS - {"__RESET"}), "MESSAGE", "vector", "numeric_limits", "true", "false", "x"]
-    definitions = standard_definitions().extended(
+    definitions = standard_definitions().merge(
         Definitions.from_files({"own/Words.msg": "".join(f"float64 {word}\n" for word in words)})
     )
     chance = random.Random(5)  # noqa: S311  no secret

@@ -19,7 +19,7 @@ def with_function(module: bytes, number: int, code: Code) -> bytes:
     """Return a module with another body for one of its functions."""
     parts = dict(decoding.sections(module))
     reader = Reader(parts[decoding.CODES])
-    bodies = [reader.take(reader.unsigned()) for _ in range(reader.unsigned())]
+    bodies = [reader.take(reader.read_unsigned()) for _ in range(reader.read_unsigned())]
     bodies[number] = _body(code)
     parts[decoding.CODES] = row([unsigned(len(body)) + body for body in bodies])
     return module[:8] + b"".join(section(kind, content) for kind, content in parts.items())

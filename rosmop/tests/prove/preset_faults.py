@@ -70,7 +70,7 @@ def answers(good: str, faulty: str, patience: float) -> list[str]:
 def _validation(
     good: str, faulty: str, patience: float
 ) -> tuple[Validation, list[tuple[str, EventCode, int]]]:
-    known = standard_definitions().extended(definitions())
+    known = standard_definitions().merge(definitions())
     form, other = (compiled(text, known) for text in (good, faulty))
     [group] = groups(form.specifications)
     right, wrong = written_of(form), written_of(other)

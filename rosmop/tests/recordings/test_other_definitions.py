@@ -8,7 +8,7 @@ from struct import pack
 import pytest
 from rosbags.rosbag1 import Writer
 
-from rosmop.batch.jobs import packed, unpacked, work
+from rosmop.batch.jobs import to_bytes, unpack, work
 from rosmop.batch.recording_list import recordings_of
 from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications
 from rosmop.recordings.replay import EVER
@@ -60,8 +60,8 @@ def record(path: Path, others: Sequence[Sent], *, first: bool, caller: str = "/o
 def strictly_replayed(path: Path) -> object:
     (recording,) = recordings_of([path], [])
     specifications = Specifications({"m.rv": Path("m.rv").read_text()}, {})
-    return unpacked(
-        work(packed(ReplayJob(recording, specifications, ["*"], EVER, 1, margins=False, strict=True)))
+    return unpack(
+        work(to_bytes(ReplayJob(recording, specifications, ["*"], EVER, 1, margins=False, strict=True)))
     )
 
 
@@ -158,6 +158,6 @@ def test_messages_that_monitors_published_change_nothing(
         job = ReplayJob(
             recording, specifications, ["*"], EVER, 0, margins=False, strict=True, own="/guardian"
         )
-        outputs[beside].append(unpacked(work(packed(job))))
+        outputs[beside].append(unpack(work(to_bytes(job))))
         Path("x.bag").unlink()
     assert outputs[False] == outputs[True]

@@ -9,7 +9,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from rosmop.check.sources import compiled_from
-from rosmop.learn.exercised import covered
+from rosmop.learn.exercised import coverage
 from rosmop.learn.passes import AlarmFacts, AlarmStep, facts_of
 from rosmop.recordings.recording import RecordedFile, open_recording
 from rosmop.recordings.replay import EVER, replay
@@ -91,6 +91,6 @@ def test_coverage_and_alarms_reach_the_end_of_a_recording(tmp_path: Path) -> Non
     for bag, read in ((own, topics), (beside, topics | {"/beside": "std_msgs/Int8"})):
         recording = RecordedFile(bag, [*read], kinds=read, known=known)
         step = AlarmStep(0, BEGIN, END, 0, 1, read, tuple(texts.values()), says)
-        results.append((covered(texts, known, recording), facts_of(step, recording, known)))
+        results.append((coverage(texts, known, recording), facts_of(step, recording, known)))
     assert results[0] == results[1]
     assert results[0][1] != AlarmFacts()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import FactWithdrawn, NodePlaced, StateEnded
-from appliance.relay.process import fitted
+from appliance.relay.process import fit_limits
 from appliance.relay.relay_limits import RelayLimits
 from tests.support.processes import LIMIT
 from tests.support.relay_driver import LOOPBACK, RelayProcess
@@ -30,7 +30,7 @@ def test_it_reports_that_it_is_ready_and_its_congestion_control(relay: RelayProc
     assert relay.ready.detail["congestion"] in {"cubic", "reno"}
     assert (
         relay.ready.detail["connections"]
-        == fitted(RelayLimits(), relay.ready.detail["descriptors"]).connections
+        == fit_limits(RelayLimits(), relay.ready.detail["descriptors"]).connections
     )
 
 

@@ -33,12 +33,12 @@ def main(*_given: Any) -> None:
 
 
 def run_modules(*_given: Any) -> None:
-    from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated  # noqa: PLC0415  within the sandbox, as a relay loads it
+    from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translate  # noqa: PLC0415  within the sandbox, as a relay loads it
 
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
     machines = []
     for _ in range(2):
-        one = WasmInstance(translated(DIVIDES, 1 << 24), 1 << 24)
+        one = WasmInstance(translate(DIVIDES, 1 << 24), 1 << 24)
         machines.append(one)
         one.reserve(1 << 24)
         one.memory[-1] = 1

@@ -13,7 +13,7 @@ from playwright.sync_api import Route, expect
 
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.log.record_format import LogEntry, as_object
-from appliance.audit.search.equality import equality_of, grouped
+from appliance.audit.search.equality import equality_of, group_equal
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
 
@@ -341,7 +341,7 @@ def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
         for some in (entries, entries[::-1]):
             expected = [
                 [row.first.sequence, row.last.sequence, row.records, row.count, row.value]
-                for row in grouped(some)
+                for row in group_equal(some)
             ]
             assert page.evaluate(rows, page_of(some[::-1])) == expected
 

@@ -136,7 +136,7 @@ def forged(site: TunnelSite, laptop: ScriptHost) -> None:
     unknown = site.attacker.namespace
     interfaces.add_address(unknown, "lo", f"{OWN}/32")
     try:
-        with unknown.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        with unknown.inside(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind((OWN, 0))
             sock.sendto(b"forged", (OCU, 20_000))  # the ports of nodes or another: none
         deadline = time.monotonic() + LIMIT
@@ -277,7 +277,7 @@ def test_without_its_tunnel_a_host_talks_to_no_false_appliance(
     interfaces.add_address(false, "lo", f"{OWN}/32")
     interfaces.add_route(inside, f"{OWN}/32", ATTACKER)
     try:
-        with false.entered(), socket.create_server((OWN, 11311)):
+        with false.inside(), socket.create_server((OWN, 11311)):
             eventually(
                 lambda: "ipsec0" not in laptop.run("ip", "-brief", "link").stdout, lambda: "charon has ended"
             )

@@ -56,7 +56,7 @@ def isolated(bare: Host, tmp_path: Path) -> Iterator[Isolation]:
 
 @contextlib.contextmanager
 def serving(namespace: Namespace, port: int) -> Iterator[socket.socket]:
-    with namespace.entered():
+    with namespace.inside():
         server = socket.create_server(("::", port), family=socket.AF_INET6, dualstack_ipv6=True)
     server.settimeout(10)
     with server:
@@ -74,7 +74,7 @@ def beside(function: Callable[[], Any], main_in: Namespace) -> Any:
 
     thread = threading.Thread(target=work)
     thread.start()
-    with main_in.entered():
+    with main_in.inside():
         entered.set()
         thread.join()
     return found[0]
@@ -146,7 +146,7 @@ def test_threads_work_on_the_host_while_the_main_thread_starts_a_process(bare: H
             expected = {name: use() for name, use in uses.items()}
             found = {name: beside(use, isolation.namespace) for name, use in uses.items()}
             assert found == expected
-            with isolation.namespace.entered():
+            with isolation.namespace.inside():
                 assert own != Namespace.own()
                 assert {name: use() for name, use in uses.items()} == expected
     finally:
@@ -222,7 +222,7 @@ def test_a_continuous_tunnel_follows_the_rules(bare: Host, node: Host, tmp_path:
         own.close()  # as when the host's strongSwan is stopped
         with isolated(bare, tmp_path) as isolation:
             isolation.forward_tunnels()
-            with isolation.namespace.entered():
+            with isolation.namespace.inside():
                 charon = socket.socket(family, socket.SOCK_DGRAM)
             with charon:
                 charon.bind((wildcard, 4500))
@@ -305,7 +305,7 @@ def test_the_appliance_does_not_reach_the_hosts_loopback(bare: Host, tmp_path: P
             f"ip route add 127.0.0.1 via {ends.host} dev eth0 src {ends.appliance}",
         ):
             assert inside.popen(command.split()).wait(timeout=20) == 0
-        with inside.entered(), pytest.raises(TimeoutError):
+        with inside.inside(), pytest.raises(TimeoutError):
             socket.create_connection(("127.0.0.1", 34567), timeout=1)
         dropped = next(
             rule for rule in isolation.rules() if "loopback" in rule.purpose and rule.chain == "ROSRV-IN"

@@ -130,7 +130,7 @@ def test_without_rules_the_machines_own_packets_are_recognized(
 def test_forged_source_addresses_do_not_arrive(machine: Host, behind: Namespace, tmp_path: Path) -> None:
     guest = guest_behind(machine.namespace, behind, DOCKER)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
-        with isolation.namespace.entered():
+        with isolation.namespace.inside():
             wire = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(ETH_P_ALL))
         with wire:
             for family in (4, 6):

@@ -67,7 +67,7 @@ def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[Mak
     def sign(number: int, text: bytes, *, oldest: bool = True) -> None:
         if logs:  # requests made by the constructor are repeated by `request_signatures`
             notary.sign(text)
-            logs[-1].signed(number, key.sign(text), public)
+            logs[-1].store_signature(number, key.sign(text), public)
 
     def accept(number: int, checkpoint: bytes, newest: bytes) -> None:
         if not logs:

@@ -151,11 +151,11 @@ def test_data_of_the_first_day_is_as_old_as_it_is(machine: Machine) -> None:
     machine.run(8 * HOUR)
     machine.off(HOUR)
     machine.run(20 * HOUR)
-    assert abs(machine.age.dated(date) - made) < DAY
-    assert machine.age.dated(before - HOUR) == before - HOUR
+    assert abs(machine.age.true_date(date) - made) < DAY
+    assert machine.age.true_date(before - HOUR) == before - HOUR
     machine.off(80 * DAY)
     machine.run(30 * HOUR)
-    assert abs(machine.age.dated(date) - made) < DAY
+    assert abs(machine.age.true_date(date) - made) < DAY
 
 
 def test_each_program_that_dates_data_dates_it_by_the_latest() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.base.withdrawal import WithdrawnError, awaited, require_awaited, take_effect
+from appliance.base.withdrawal import WithdrawnError, require_awaited, take_effect, withdrawable
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import KEPT
 from appliance.control.operators.queries import Queries
@@ -20,7 +20,7 @@ from tests.support.idle import idle
 
 def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
     gone = False
-    with awaited(lambda: gone):
+    with withdrawable(lambda: gone):
         require_awaited()
         gone = True
         with pytest.raises(WithdrawnError, match="nothing was changed"):
@@ -36,7 +36,7 @@ def test_only_orders_are_withdrawn() -> None:
     take_effect()
 
     async def order() -> asyncio.Task[None]:
-        with awaited(lambda: True):
+        with withdrawable(lambda: True):
             return asyncio.create_task(later())
 
     async def later() -> None:

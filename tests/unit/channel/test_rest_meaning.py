@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from appliance.channel import admin
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.operations import OPERATIONS
-from appliance.channel.rest_meaning import BadTagError, NoOrderError, RestCall, call_of, filled_in, meant
+from appliance.channel.rest_meaning import BadTagError, NoOrderError, RestCall, call_of, filled_in, order_of
 from appliance.channel.rest_operation import Operation, plain
 
 ASKED = [operation for operation in OPERATIONS if operation.path]
@@ -69,16 +69,16 @@ def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> Non
     call = call_of(order, operation)
     if not operation.is_change or "expected" not in operation.fields():
         assert not call.match
-        assert filled_in(meant(request_of(call, "")), order) == order
+        assert filled_in(order_of(request_of(call, "")), order) == order
         return
     assert call.match
-    assert filled_in(meant(request_of(call, "*")), order) == order
+    assert filled_in(order_of(request_of(call, "*")), order) == order
     numbered = plain(operation.fields()["expected"].type) is int
     seen = msgspec.structs.replace(order, expected=7 if numbered else "7")
-    assert filled_in(meant(request_of(call, '"7"')), seen) == seen
+    assert filled_in(order_of(request_of(call, '"7"')), seen) == seen
     for wrong in ("", "7", 'W/"7"', '"7", "8"', '"' + "9" * 91 + '"', '"-1"' if numbered else '""'):
         with pytest.raises(BadTagError):
-            meant(request_of(call, wrong))
+            order_of(request_of(call, wrong))
 
 
 @pytest.mark.parametrize(
@@ -94,6 +94,6 @@ def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> Non
 )  # fmt: skip
 def test_requests_that_are_not_orders(change: dict[str, Any]) -> None:
     good = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", b"[Nodes]\n")
-    assert meant(good) == admin.PolicyLoad("[Nodes]\n")
+    assert order_of(good) == admin.PolicyLoad("[Nodes]\n")
     with pytest.raises(NoOrderError):
-        meant(msgspec.structs.replace(good, **change))
+        order_of(msgspec.structs.replace(good, **change))

@@ -3,7 +3,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.channel.status_summary import no_relay, process_names, unserved
+from appliance.channel.status_summary import no_relay, process_names, why_unserved
 from tests.support.answers import example
 
 SERVING: dict[str, Any] = {
@@ -14,10 +14,10 @@ SERVING: dict[str, Any] = {
 
 
 def test_a_serving_appliance_has_no_reason() -> None:
-    assert unserved(example(Status, **SERVING)) is None
-    assert unserved(example(Status, **SERVING | {"probe": ""})) is None
+    assert why_unserved(example(Status, **SERVING)) is None
+    assert why_unserved(example(Status, **SERVING | {"probe": ""})) is None
     audit = {"failed": "disk full", "on_failure": "allow"}
-    assert unserved(example(Status, **SERVING, audit=audit)) is None
+    assert why_unserved(example(Status, **SERVING, audit=audit)) is None
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_a_serving_appliance_has_no_reason() -> None:
     ],
 )
 def test_reasons_for_not_serving_are_named(wrong: dict[str, Any], reason: str) -> None:
-    assert reason in str(unserved(example(Status, **SERVING | wrong)))
+    assert reason in str(why_unserved(example(Status, **SERVING | wrong)))
 
 
 def test_one_missing_relay_is_counted() -> None:

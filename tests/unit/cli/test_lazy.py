@@ -9,7 +9,7 @@ import typer
 from rosrv_fleet.cli import app as fleet_app
 from typer.testing import CliRunner
 
-from appliance.cli.lazy import loaded
+from appliance.cli.lazy import load_command
 from appliance.cli.main import app
 from appliance.cli.verb_table import Verb
 from distribution import command_line_page
@@ -23,7 +23,7 @@ ROSRV = str(Path(sys.executable).parent / "rosrv")
 
 def test_the_table_matches_the_verbs() -> None:
     for name, verb in table():
-        own = str(loaded(verb, name.split()[-1]).help)
+        own = str(load_command(verb, name.split()[-1]).help)
         assert " ".join(own.split("\n\n", maxsplit=1)[0].split()) == verb.help, name
 
 
@@ -47,7 +47,7 @@ def pages() -> str:
 
 @pytest.mark.parametrize(("name", "verb"), [pytest.param(*row, id=row[0]) for row in table()])
 def test_every_verb_has_help_with_an_example(name: str, verb: Verb) -> None:
-    command = loaded(verb, name.rsplit(maxsplit=1)[-1])
+    command = load_command(verb, name.rsplit(maxsplit=1)[-1])
     if command.hidden or name.rsplit(maxsplit=1)[-1] == "rvstate":  # it only gives ROSRV's own flags a name
         return
     assert f"rosrv {name}" in pages(), f"no page names rosrv {name}"

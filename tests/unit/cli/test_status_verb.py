@@ -1,5 +1,5 @@
 from appliance.base.timestamps import age
-from appliance.cli.status_verb import shortened
+from appliance.cli.status_verb import shorten
 
 
 def test_ages_are_two_units() -> None:
@@ -9,5 +9,5 @@ def test_ages_are_two_units() -> None:
 
 
 def test_few_lines_are_not_shortened() -> None:
-    assert shortened(["a", "b"], 2) == ["a", "b"]
-    assert shortened(["a", "b", "c"], 2) == ["a", "and 2 more: rosrv status --json"]
+    assert shorten(["a", "b"], 2) == ["a", "b"]
+    assert shorten(["a", "b", "c"], 2) == ["a", "and 2 more: rosrv status --json"]

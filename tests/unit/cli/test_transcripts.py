@@ -43,7 +43,7 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
         file,
         checkpoint_every=10 if signed else 1000,
         signer=lambda number, text, **_: (
-            logs[0].signed(number, key.sign(text), public) if signed and logs else None
+            logs[0].store_signature(number, key.sign(text), public) if signed and logs else None
         ),
     )
     logs.append(log)

@@ -61,4 +61,4 @@ def test_the_lines_of_the_demonstration_can_be_removed() -> None:
     rules = "\n".join(line for line in without.splitlines() if not line.startswith("#"))
     assert "landshark" not in rules and "tablet" not in rules
     for text in (file.read_text(), without):
-        judge(text, "containers.ini", PolicyContext(cases_file="cases", cases=cases)).accepted()
+        judge(text, "containers.ini", PolicyContext(cases_file="cases", cases=cases)).accept()

@@ -84,7 +84,7 @@ def made(folder: Path, seed: int) -> Site:
             assert settle(log) is None
             for checkpoint, text in asked:
                 signer.accept(text)
-                log.signed(checkpoint, key.sign(text), key.public_key().public_bytes_raw())
+                log.store_signature(checkpoint, key.sign(text), key.public_key().public_bytes_raw())
             asked.clear()
 
     add(45)

@@ -59,7 +59,7 @@ def _push(found: SegmentStore, make_log: MakeLog, path: Path, tmp_path: Path) ->
         place = found.keep("arm1", upload, summary, 1)
         upload.unlink()
         os.utime(found.path(place), (1e9, 1e9))
-        found.indexed(place)
+        found.mark_indexed(place)
     assert log.close() is None
 
 

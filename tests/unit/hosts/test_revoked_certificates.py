@@ -34,7 +34,7 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 
 def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: Path) -> int:
     directory.mkdir()
-    rows = [(row.serial, row.moment) for row in revoked.listed(enrolled)]
+    rows = [(row.serial, row.moment) for row in revoked.rows_to_send(enrolled)]
     signed = x509.load_pem_x509_crl(CertificateAuthority(directory).revocations(rows))
     assert len(signed) == len(rows)
     return len(signed.public_bytes(Encoding.DER))
@@ -46,9 +46,9 @@ def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) ->
     now = clock.wall()
     for serial, expires in (("a1", now + DAY), ("a2", now - DAY / 2), ("a3", now - 2 * DAY)):
         revoked.add("a", serial, expires)
-    assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
+    assert {row.serial for row in revoked.rows_to_send({"a"})} == {"a1", "a2"}
     revoked.forget_ended()
-    assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
+    assert {row.serial for row in revoked.rows_to_send({"a"})} == {"a1", "a2"}
 
 
 @pytest.mark.parametrize("years", [1, 3, 70])
@@ -61,11 +61,11 @@ def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path, years: 
         revoked = RevokedCertificates(store.hosts)
         ahead.advance(0.9 * DAY)
         revoked.forget_ended()
-        assert revoked.listed({"a"}) == []
+        assert revoked.rows_to_send({"a"}) == []
         assert revoked.missing({"a"}) == revoked.wait_for_room({"a"}) == 0
     store.close()
     again = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    assert [row.serial for row in RevokedCertificates(again.hosts).listed({"a"})] == ["a1"]
+    assert [row.serial for row in RevokedCertificates(again.hosts).rows_to_send({"a"})] == ["a1"]
     again.close()
 
 
@@ -86,12 +86,12 @@ def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
     running = VirtualClock(wall=now)
     with using(running):
         revoked = RevokedCertificates(second.hosts)
-        assert [row.serial for row in revoked.listed({"a"})] == ["a1", "b1"]
+        assert [row.serial for row in revoked.rows_to_send({"a"})] == ["a1", "b1"]
         running.advance(1.1 * DAY)
         revoked.forget_ended()
     second.close()
     third = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    assert {row.serial for row in third.hosts.revoked()} == {"a1", "b1"}
+    assert {row.serial for row in third.hosts.revoked_certificates()} == {"a1", "b1"}
     third.close()
 
 
@@ -100,11 +100,11 @@ def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_p
     expires = clock.wall() + 90 * DAY
     for serial in serials(2_000):
         revoked.add("enrolled", serial, expires)
-    assert len(revoked.listed({"enrolled"})) == 2_000
+    assert len(revoked.rows_to_send({"enrolled"})) == 2_000
     for serial in serials(2_000):
         revoked.add("gone", serial, expires)
-    assert {row.name for row in revoked.listed({"enrolled"})} == {"enrolled"}
-    assert len(revoked.listed({"enrolled"})) == 2_000
+    assert {row.name for row in revoked.rows_to_send({"enrolled"})} == {"enrolled"}
+    assert len(revoked.rows_to_send({"enrolled"})) == 2_000
     assert revoked.missing({"enrolled"}) == 0
     assert bytes_of_list(revoked, {"enrolled"}, tmp_path / "ca") <= LONGEST
 

@@ -122,7 +122,7 @@ class SignedLog:
 
     def __init__(self, folder: Path, age: AgeClock) -> None:
         self._signed = CheckpointMemory(folder, age)
-        self._removals = RemovalJudge(self._signed, RetentionLimits(days=KEPT / DAY), age, age.dated)
+        self._removals = RemovalJudge(self._signed, RetentionLimits(days=KEPT / DAY), age, age.true_date)
         head = f"rosrv audit checkpoint 1\nlog {LOG}\nnumber 1\nsequence 9\nhash {'b' * 64}\n"
         self._text = f"{head}time 1\nprevious {'0' * 64}\n".encode()
 

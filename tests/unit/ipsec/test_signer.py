@@ -202,7 +202,7 @@ async def test_log_and_signer_together(new_link: Callable[[], Channel], tmp_path
     while verify(path).signed_checkpoints < verify(path).checkpoints:
         for message in await heard_from(link[0]):
             assert isinstance(message, SignatureMade)
-            log.signed(message.number, message.signature, message.public_key)
+            log.store_signature(message.number, message.signature, message.public_key)
         await log.wait_durable()
     log.close()
     result = verify(path, signer=tmp_path / "signer")

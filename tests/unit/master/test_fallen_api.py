@@ -82,7 +82,7 @@ class Api:
 
     async def signed(self, token: str, asked: ClientRequest) -> ClientRequest:
         answer = await self.ask(admin.ChallengeWanted(), reading_key(token))
-        challenge = answer.given().challenge
+        challenge = answer.unwrap().challenge
         stated = statement(
             challenge,
             method=asked.method,
@@ -160,7 +160,7 @@ async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
     api = Api(world)
     assert "already used" in (await api.ask(order, shown, seen)).error
     api.close()
-    await world.core.store.settled()
+    await world.core.store.until_settled()
     world.begin(require_proof=False)
     api = Api(world)
     for old in (seen, kept_back):
@@ -246,7 +246,7 @@ async def test_bare_tokens_are_accepted_by_configuration_only(
     world: World, token: str, *, require_proof: bool
 ) -> None:
     """With `api_require_proof`, a bare token still opens the views."""
-    await world.core.store.settled()
+    await world.core.store.until_settled()
     world.begin(require_proof=require_proof)
     api = Api(world)
     order = admin.PolicyLoad("[Nodes]\n", expected=3)
@@ -262,7 +262,7 @@ async def test_a_token_of_an_earlier_version_stays_valid(world: World) -> None:
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     token = row.token
     world.core.store.database.delete("token_keys", id=row.id)
-    await world.core.store.settled()
+    await world.core.store.until_settled()
     world.begin(require_proof=False)
     api = Api(world)
     order = admin.PolicyLoad("[Nodes]\n", expected=3)

@@ -184,7 +184,7 @@ def test_a_step_of_the_restoration_that_fails_for_a_time_loses_nothing(
     kernel.failing = ""
     told.append(kernel.restored())
     assert (bool(kernel.rules), bool(kernel.protection)) == (True, True)
-    rules = [rule.purpose for rule in kernel.isolation._wanted()]
+    rules = [rule.purpose for rule in kernel.isolation._wanted_rules()]
     told_once = [purpose for one in told for purpose in one if purpose != _OPEN]
     assert sorted(told_once) == sorted([*rules, "rosrv protect"])
     assert (kernel.restored(), kernel.isolation.unprotected) == ([], "")
@@ -208,7 +208,7 @@ def test_a_change_that_failed_is_made_by_the_next_call(name: str, step: str, ker
         CHANGES[name](kernel.isolation)
     kernel.failing = ""
     CHANGES[name](kernel.isolation)
-    assert kernel.rules == kernel.isolation._wanted() != before
+    assert kernel.rules == kernel.isolation._wanted_rules() != before
     assert kernel.forgotten[-1] == kernel.rules
 
 
@@ -221,7 +221,7 @@ def test_a_change_that_failed_is_made_by_the_next_check(name: str, kernel: Kerne
         CHANGES[name](kernel.isolation)
     kernel.failing = ""
     assert kernel.restored() == []
-    assert kernel.rules == kernel.isolation._wanted()
+    assert kernel.rules == kernel.isolation._wanted_rules()
 
 
 def test_closed_ports_that_cannot_be_closed_again_are_reported_until_they_are(kernel: Kernel) -> None:

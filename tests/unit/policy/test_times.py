@@ -104,7 +104,7 @@ def test_a_denial_outside_the_time_gives_the_reason() -> None:
     )
     ended = policy("10.0.0.7 until 2026-12-05", "2026-12-07")
     assert (
-        ended.unnamed(HOST)
+        ended.why_unnamed(HOST)
         == "no rule of the policy names 10.0.0.7 now: its right until 2026-12-05 has ended"
     )
     [warning] = [one for one in ended.warnings if one.line == 7]

@@ -11,7 +11,7 @@ from appliance.quotas.table import (
     QuotaRow,
 )
 from appliance.relay.monitors.time_budget import TimeBudget
-from distribution.generated_pages import all_rows, allowed
+from distribution.generated_pages import all_rows, bound_of
 
 WITHOUT_NUMBER = {RVMASTER_FAREWELLS.thing, LIMITED_TOPIC.thing}
 
@@ -24,13 +24,13 @@ def test_each_row_fits_an_honest_use_or_says_what_it_notices() -> None:
     for row in all_rows():
         use, needs, _of, beyond = row.margin
         assert use or row is RVMASTER_FAREWELLS, row.thing  # no honest host is rejected
-        assert needs <= allowed(row) or beyond, f"{use} needs {needs} of {allowed(row)} {row.thing}"
+        assert needs <= bound_of(row) or beyond, f"{use} needs {needs} of {bound_of(row)} {row.thing}"
         assert needs or "wait" in row.at_limit or row.thing in WITHOUT_NUMBER, row.thing
 
 
 def test_only_turns_are_too_few_for_an_honest_use() -> None:
     """Beyond these bounds work waits for its turn, or costs a connection: nothing of an honest host is rejected."""
-    short = [row for row in QUOTA_ROWS if row.margin.needs > allowed(row)]
+    short = [row for row in QUOTA_ROWS if row.margin.needs > bound_of(row)]
     assert short == [RVMASTER_CONNECTIONS, RVMASTER_REQUESTS, PROBES, NODE_CALLS_UNDER_WAY]
 
 

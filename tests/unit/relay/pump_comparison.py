@@ -163,7 +163,7 @@ class ComparedRelay(Monitored):
         return {"counted": dict(self.counted), "rows": rows}
 
     def recovered(self, statement: SpecificationsStated) -> list[bytes]:
-        left = StateKeeper(self.given, self.memory).recovered()
+        left = StateKeeper(self.given, self.memory).recover()
         monitors = Loader.load(statement, str)
         if left is None or isinstance(monitors, list):
             return []

@@ -175,7 +175,7 @@ class World:
 
     @property
     def held(self) -> int:
-        return sum(size for what, size in self.engine.memory.held().items() if what != "headers")
+        return sum(size for what, size in self.engine.memory.bytes_held().items() if what != "headers")
 
     def state(self, message: Message, *sockets: socket.socket) -> None:
         self.control.send(message, tuple(sock.fileno() for sock in sockets))

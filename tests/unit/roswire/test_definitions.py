@@ -61,7 +61,7 @@ def test_a_type_has_one_definition() -> None:
 
 def test_extending_lets_the_new_types_win(standard: Definitions) -> None:
     own = Definitions.from_files({"geometry_msgs/Point.msg": "float32 x\n"})
-    both = standard.extended(own)
+    both = standard.merge(own)
     assert both.md5sum("geometry_msgs/Point") == own.md5sum("geometry_msgs/Point")
     assert both.md5sum("geometry_msgs/Pose") != standard.md5sum("geometry_msgs/Pose")
     assert standard.md5sum("geometry_msgs/Pose") == "e45d45a5a1ce597b249e23fb30fc871f"

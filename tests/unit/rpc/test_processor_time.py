@@ -133,7 +133,7 @@ def test_a_charge_costs_the_same_for_any_number_of_hosts() -> None:
     for number in range(2, 5000):
         line.charge(Host(number), 1.0)
     assert looked_at < 10 * 5000
-    assert line.used(debtor) == 60.0, "a debt of one host was forgotten for the small ones of many"
+    assert line.time_used(debtor) == 60.0, "a debt of one host was forgotten for the small ones of many"
 
 
 async def test_steps_of_coroutines_are_charged_and_wait(loop: Loop) -> None:

@@ -254,7 +254,7 @@ class Dialogue:
         desk = self.desk
         match said:
             case ["start", *how]:
-                await desk.store.settled()
+                await desk.store.until_settled()
                 given: dict[str, Any] = dict(word.split("=") for word in how if "=" in word)
                 start = desk.monitors(restarted="restarted" in how, folder="no-folder" not in how, **given)
                 try:

@@ -5,7 +5,7 @@ from appliance.specifications.checking import check, parts
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
 from rosmop.check.sources import compiled_from
 from rosmop.fast import batch_codegen
-from rosmop.fast.serialization import encoded
+from rosmop.fast.serialization import encode
 from rosmop.logics import catalogue
 from rosmop.logics.automaton import Automaton
 from rosmop.logics.interface import FiniteProperty, Logic, Source
@@ -36,6 +36,6 @@ def test_a_wrong_automaton_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_no_relay_gets_a_wrong_module(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_codegen.TopicCodegen, "_handle", lambda *_: b"")
-    compiled = encoded(compiled_from({"guard.rv": GUARD}, standard_definitions()))
+    compiled = encode(compiled_from({"guard.rv": GUARD}, standard_definitions()))
     with pytest.raises(SpecificationsRefusedError, match="this is a defect of the monitor compiler"):
         parts(compiled, [PartNames(("guard",))])

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.base.withdrawal import WithdrawnError, withdrawable
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.specifications.compiled_store import CompiledStore
@@ -148,7 +148,7 @@ async def test_a_compilation_ends_when_its_order_is_withdrawn() -> None:
     gone = False
 
     async def order() -> None:
-        with awaited(lambda: gone):
+        with withdrawable(lambda: gone):
             await scene.compiler.check(SOURCES, ())
 
     withdrawn = asyncio.ensure_future(order())

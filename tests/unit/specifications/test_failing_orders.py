@@ -173,7 +173,7 @@ async def waiting_for_all_orders(desk: Desk) -> SpecificationManager:
     await monitors.switch(admin.MonitorSwitch(["off"], False, for_seconds=600.0), "eve")
     await monitors.load(admin.MonitorLoad({"b.rv": B}, shadow=True, confirm_within=600.0), "eve")
     monitors.received(messages.SpecificationsTaken(3, [], ["a"]))
-    await desk.store.settled()
+    await desk.store.until_settled()
     return monitors
 
 
@@ -272,7 +272,7 @@ async def test_a_kill_after_an_order_is_stored_leaves_the_next_value(
     assert set(again.ends.names(TIMED)) == set(new.returns)
     stated = again.statement(0)
     assert stated.enabled == {name: state is not False for name, state in new.states.items()}
-    assert set(stated.shadows) == set(new.switches.shadowed())
+    assert set(stated.shadows) == set(new.switches.shadowed_monitors())
 
 
 async def test_disabled_periods_end_even_on_a_full_disk(desk: Desk) -> None:
@@ -300,7 +300,7 @@ async def test_an_order_that_is_carried_out_before_an_end_that_is_due_stands_unl
     await slow.begun.wait()
     for_good = asyncio.ensure_future(monitors.switch(admin.MonitorSwitch(["a"], False), "eve"))
     await asyncio.sleep(0)
-    await until(lambda: all(monitors.ends.passed(kind, name) for kind, name in due(monitors)))
+    await until(lambda: all(monitors.ends.is_over(kind, name) for kind, name in due(monitors)))
     monitors.ends.look()
     await asyncio.sleep(0)
     slow.goes_on.set()

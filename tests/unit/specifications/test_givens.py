@@ -52,7 +52,7 @@ async def test_a_value_is_set_recorded_and_kept(desk: Desk) -> None:
     assert (record["values"], record["before"]) == ({"vMax": 0.3, "on": False}, {"vMax": 0.22, "on": True})
     assert sha == [one["sha256"] for event, one in desk.trail.heard if event == "specifications loaded"]
     for restarted in (False, True):
-        await desk.store.settled()
+        await desk.store.until_settled()
         again = await desk.monitors(restarted=restarted)
         assert stated(again) == {"vMax": 0.3, "on": False, "n": 3}
         assert values(again) == {"vMax": 0.3, "n": 3, "on": False, "command": "/cmd"}
@@ -95,7 +95,7 @@ async def test_a_load_sets_topics_and_constants_or_nothing(desk: Desk) -> None:
             await monitors.load(order, "eve")
         with pytest.raises(SpecificationsRefusedError):
             await monitors.attempt(admin.MonitorTry(order), "eve")
-    await desk.store.settled()
+    await desk.store.until_settled()
     again = await desk.monitors()
     assert set(again.checked.topics["cap"]) == {values(again)["command"]} == {"/base/cmd"}
     await again.roll_back(admin.MonitorRollback(1), "eve")
@@ -110,7 +110,7 @@ async def test_topics_of_the_folders_files_survive_a_reload_and_a_start(desk: De
     await monitors.load(admin.MonitorLoad({"cap.rv": TEXT}, given={"cap": {"command": "/base/cmd"}}), "eve")
     await monitors.reload(admin.MonitorReload(), "eve")
     assert (set(monitors.checked.topics["cap"]), monitors.differs_from_folder) == ({"/base/cmd"}, False)
-    await desk.store.settled()
+    await desk.store.until_settled()
     (desk.folder / "cap.rv").write_text(TEXT + "// edited")
     assert set((await desk.monitors()).checked.topics["cap"]) == {"/base/cmd"}
 

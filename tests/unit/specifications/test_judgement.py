@@ -3,8 +3,8 @@ from collections.abc import Sequence
 import pytest
 
 from appliance.specifications.checking import check
-from appliance.specifications.in_force import Consent, InForce, switched
-from appliance.specifications.judgement import Judge, beside_broken, broken, in_shadow
+from appliance.specifications.in_force import Consent, InForce, switch
+from appliance.specifications.judgement import Judge, beside_broken, broken_files, in_shadow
 from appliance.specifications.live_topics import LiveType
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
@@ -38,7 +38,7 @@ def judge_of(**live: LiveType) -> Judge:
 
 async def test_a_file_that_does_nothing_stays_idle_until_it_is_loaded() -> None:
     checked = await beside_broken(NOW, refuse_bad, (), SOURCES)
-    assert checked.left_out == broken(NOW) == {"bad.rv": "an error"}
+    assert checked.left_out == broken_files(NOW) == {"bad.rv": "an error"}
     assert [warning for warning in checked.warnings if "bad.rv:1:1: warning: it does nothing" in warning]
     with pytest.raises(SpecificationsRefusedError) as refused:
         await beside_broken(NOW, refuse_bad, (), SOURCES, loaded={"bad.rv"})
@@ -56,11 +56,11 @@ async def test_a_cut_topic_needs_consent() -> None:
     sources = Sources({"good.rv": GOOD})
     coming, judge = InForce(2, sources, check(sources, ())), judge_of(t=LiveType("std_msgs/Int32"))
     with pytest.raises(SpecificationsRefusedError, match="/node publishes /t as std_msgs/Int32"):
-        judge.judged(InForce(), coming, (), Consent())
-    (warning,) = judge.judged(InForce(), coming, (), Consent(force=True))
+        judge.judge(InForce(), coming, (), Consent())
+    (warning,) = judge.judge(InForce(), coming, (), Consent(force=True))
     assert "std_msgs/Int32" in warning
-    assert judge.judged(InForce(), coming, in_shadow(switched(coming, ["Good"], SHADOW)), Consent()) != []
-    assert judge_of(t=LiveType("std_msgs/String")).judged(InForce(), coming, (), Consent()) == []
+    assert judge.judge(InForce(), coming, in_shadow(switch(coming, ["Good"], SHADOW)), Consent()) != []
+    assert judge_of(t=LiveType("std_msgs/String")).judge(InForce(), coming, (), Consent()) == []
 
 
 async def test_monitors_in_shadow_are_those_of_the_value_and_of_the_named_files() -> None:
@@ -69,4 +69,4 @@ async def test_monitors_in_shadow_are_those_of_the_value_and_of_the_named_files(
     )
     assert in_shadow(both) == set()
     assert in_shadow(both, ["other.rv"]) == {"Other"}
-    assert in_shadow(switched(both, ["Good"], SHADOW), ["other.rv"]) == {"Good", "Other"}
+    assert in_shadow(switch(both, ["Good"], SHADOW), ["other.rv"]) == {"Good", "Other"}

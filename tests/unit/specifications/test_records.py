@@ -77,7 +77,7 @@ def test_the_records_of_a_host_have_the_number_of_its_actions_under_any_flood(ho
         take("drop", "10.0.0.2", "one")
     for _ in range(300):
         now += 100
-        for event, _whole in repetitions.ended(now):
+        for event, _whole in repetitions.pop_ended(now):
             note(event)
     assert recorded == sent
     assert not repetitions.some

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.base.withdrawal import WithdrawnError, withdrawable
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.checking import check
@@ -310,7 +310,7 @@ async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors() ->
 
 async def test_a_withdrawn_load_leaves_nothing_in_memory(fleet: Fleet) -> None:
     before = dict(fleet.rollout.compiled_parts)
-    with awaited(lambda: True), pytest.raises(WithdrawnError):
+    with withdrawable(lambda: True), pytest.raises(WithdrawnError):
         await fleet.rollout.take(revision(2, **fleet.files, c=spec("c", "/c")))
     assert fleet.rollout.compiled_parts == before
     assert not fleet.stated

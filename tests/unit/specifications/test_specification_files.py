@@ -122,6 +122,6 @@ def test_a_text_needs_its_own_signature_although_another_of_its_name_has_one(
     sources = Sources(texts["files"], texts["definitions"], good.signatures)
     with pytest.raises(SpecificationsRefusedError, match="is not the text"):
         sources.signers([LINE])
-    left, errors = sources.signed([LINE])
-    assert OWN not in left.named().values()
+    left, errors = sources.signed_only([LINE])
+    assert OWN not in left.by_name().values()
     assert list(errors) == [name if unsigned == "files" else f"msg/{name}"]

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.base.withdrawal import WithdrawnError, withdrawable
 from appliance.channel import admin, messages
 from appliance.channel.alarms import open_alarms
 from appliance.channel.answers.status import Status
@@ -72,7 +72,7 @@ async def test_a_load_that_enables_ends_no_shadow_mode(desk: Desk, setting: str,
     monitors = await desk.monitors(setting)
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve", enable=True)
     assert monitors.switches.states["b"] == state
-    assert monitors.switches.enabled("a") is (setting == "all")
+    assert monitors.switches.is_enabled("a") is (setting == "all")
     again = await desk.monitors(setting, restarted=True)
     assert again.switches.states["b"] == state
 
@@ -91,7 +91,7 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
     assert again.until("b") is None
     desk.kill()
     later = await desk.monitors(restarted=True)
-    await until(lambda: later.switches.enabled("a"))
+    await until(lambda: later.switches.is_enabled("a"))
     await later.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
     endless = await later.switch(admin.MonitorSwitch(["a"], False), "eve")
     assert (endless.names, endless.until) == (["a"], None)
@@ -114,7 +114,7 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
     desk.check = slow = SlowCompiler()
 
     async def order(*changes: Callable[[], Any]) -> None:
-        with awaited(lambda: gone):
+        with withdrawable(lambda: gone):
             for change in changes:
                 await change()
 
@@ -180,7 +180,7 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
         task = asyncio.ensure_future(order)
         while len(desk.sent) == told:
             await asyncio.sleep(0)
-        await desk.store.settled()
+        await desk.store.until_settled()
         for _ in range(5):
             await asyncio.sleep(0)
         assert not task.done()
@@ -201,7 +201,7 @@ async def test_one_of_two_concurrent_changes_is_made(desk: Desk) -> None:
         return_exceptions=True,
     )
     assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True, True]
-    assert monitors.switches.enabled("a")
+    assert monitors.switches.is_enabled("a")
     assert messages.MonitorResumed("b") not in desk.sent
 
 
@@ -241,7 +241,7 @@ async def test_with_site_keys_only_signed_specifications_come_into_force(desk: D
     unsigned = "a.rv:1:1: error: it has no signature of the site"
     assert unsigned in (await desk.monitors(site_keys=[LINE])).checked.left_out["a.rv"]
     await desk.monitors()  # revision 1 is unsigned
-    await desk.store.settled()
+    await desk.store.until_settled()
     beside = desk.folder / "a.rv.sig"
     beside.write_text(signed(A))
     monitors = await desk.monitors(site_keys=[LINE])
@@ -595,7 +595,7 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_use(
         monitors = await desk.monitors(restarted=restarted, site_keys=[LINE])
         assert (monitors.sources.files, list(monitors.checked.left_out)) == (others, ["b.rv"])
         assert monitors.differs_from_folder
-        await desk.store.settled()
+        await desk.store.until_settled()
     if fault != "folder":
         bad.unlink()
         bad.write_text(B)
@@ -622,7 +622,7 @@ async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> No
     await monitors.shadow(promote(confirm_within=3600), "eve")
     desk.kill()
     again = await desk.monitors(restarted=True)
-    assert again.switches.enabled("a") and again.until("a", of=True) is not None
+    assert again.switches.is_enabled("a") and again.until("a", of=True) is not None
     await again.shadow(promote(confirm_within=0.05), "eve")  # a shorter limit, and still back to shadow mode
     await shadowed(again)
     await again.shadow(promote(confirm_within=3600), "eve")
@@ -630,7 +630,7 @@ async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> No
     await shadowed(again)
     await again.shadow(promote(confirm_within=3600), "eve")
     assert (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed
-    assert again.switches.enabled("a") and again.until("a", of=True) is None
+    assert again.switches.is_enabled("a") and again.until("a", of=True) is None
     assert not (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed
 
 

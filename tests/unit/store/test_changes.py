@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from appliance.store.changes import ROWS, Change, ChangeError, Delete, Put, Tables, joined
+from appliance.store.changes import ROWS, Change, ChangeError, Delete, Put, Tables, join
 
 SCHEMA = """
 CREATE TABLE thing (
@@ -98,10 +98,10 @@ def test_only_consecutive_rows_of_one_table_are_joined() -> None:
         (put("d"), False),
     ]
     expected = [(Put("thing", [("a",), ("b",)]), True), (remove, True), (remove, True), (put("c"), True)]
-    assert list(joined([*pairs, (put("e", "other"), False)])) == [
+    assert list(join([*pairs, (put("e", "other"), False)])) == [
         *expected,
         (put("d"), False),
         (put("e", "other"), False),
     ]
     many: list[tuple[Change, bool]] = [(put(str(number)), True) for number in range(2 * ROWS + 1)]
-    assert [len(change.rows) for change, _ahead in joined(many) if isinstance(change, Put)] == [ROWS, ROWS, 1]
+    assert [len(change.rows) for change, _ahead in join(many) if isinstance(change, Put)] == [ROWS, ROWS, 1]

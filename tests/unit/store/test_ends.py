@@ -180,7 +180,7 @@ async def test_a_right_that_began_before_the_clock_was_set_keeps_its_time(site: 
     kept = [(kind, name) for kind in site.things for name in site.ends.names(kind)]
     for seconds in (0.0, 10.0):  # before the table sees the step, and after it
         with clock.using(site.clocks["a"]):
-            assert not any(site.ends.passed(*one) for one in kept)
+            assert not any(site.ends.is_over(*one) for one in kept)
             dates = [site.ends.date(*one) for one in kept]
         assert dates == pytest.approx([WALL + 3000.0] * len(kept), abs=1.0)
         site.run(seconds)
@@ -360,7 +360,7 @@ async def test_a_long_time_off_is_added_to_the_ends_of_its_first_day(site: Site)
         site.run(HOUR)
     site.off(60.0)
     with clock.using(site.clocks["a"]):
-        assert site.ends.left(kind, "x") == pytest.approx(2 * DAY - 30 * HOUR - 60.0, abs=1.0)
+        assert site.ends.time_left(kind, "x") == pytest.approx(2 * DAY - 30 * HOUR - 60.0, abs=1.0)
 
 
 async def test_a_fault_of_one_owner_keeps_no_other_end(site: Site) -> None:

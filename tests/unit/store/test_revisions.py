@@ -19,7 +19,8 @@ async def never(revision: int) -> None:
 
 def limit(keeper: Keeper) -> dict[str, float | None]:
     return {
-        name: keeper.ends.left(keeper.unconfirmed, name) for name in keeper.ends.names(keeper.unconfirmed)
+        name: keeper.ends.time_left(keeper.unconfirmed, name)
+        for name in keeper.ends.names(keeper.unconfirmed)
     }
 
 
@@ -35,8 +36,8 @@ def keeper(tmp_path: Path) -> Iterator[Keeper]:
 
 @pytest.mark.nightly
 async def test_a_rollback_without_a_number_takes_the_previous_revision(keeper: Keeper) -> None:
-    assert await keeper.wanted(None) == row(5)
-    assert await keeper.wanted(4) == row(4)
+    assert await keeper.require(None) == row(5)
+    assert await keeper.require(4) == row(4)
 
 
 @pytest.mark.nightly
@@ -46,7 +47,7 @@ async def test_the_error_names_the_missing_and_the_stored_revisions(
 ) -> None:
     keeper.in_force = row(4)
     with pytest.raises(LookupError) as caught:
-        await keeper.wanted(asked)
+        await keeper.require(asked)
     assert caught.value.args == ([f"there is no revision {said}; kept are: 4, 5, 7"],)
 
 

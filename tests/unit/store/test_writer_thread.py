@@ -29,7 +29,7 @@ from appliance.store.changes import (
     Tables,
     WriteAhead,
     WriteAheadClosedError,
-    joined,
+    join,
 )
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.engines import ByHand, let_pass
@@ -128,7 +128,7 @@ async def test_changes_that_cannot_be_written_at_the_end_are_reported(
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
     blocker.execute("BEGIN EXCLUSIVE")
     database.put("thing", "late", 1)
-    waiting = asyncio.ensure_future(database.settled())
+    waiting = asyncio.ensure_future(database.until_settled())
     await asyncio.sleep(0)
     database.close()
     await asyncio.wait([waiting], timeout=0)
@@ -145,7 +145,7 @@ async def test_changes_that_cannot_be_written_at_the_end_are_reported(
 async def test_a_thread_writes_changes(tmp_path: Path) -> None:
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     database.put("thing", "a", 1)
-    await database.settled()
+    await database.until_settled()
     with sqlite3.connect(tmp_path / "state.db") as other:
         assert other.execute("SELECT name FROM thing").fetchall() == [("a",)]
         database.put("thing", "b", 1)
@@ -169,10 +169,10 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
         async def scene() -> None:
             database.put("thing", "late", 1)
             with pytest.raises(StoreError, match=r"state\.db: .*full; free space"):
-                await database.settled()
+                await database.until_settled()
             filler.unlink()
             let_pass(database, 1)
-            await database.settled()
+            await database.until_settled()
 
         passing = VirtualClock()
         with clock.using(passing):
@@ -195,12 +195,12 @@ async def test_callers_learn_of_a_defect_until_it_has_passed(
         database.put("thing", "a", 1)
         assert database.turn(clock.now()) is not None, "the thread must not end"
         with pytest.raises(StoreError, match="writing ended: RuntimeError: unforeseen"):
-            await database.settled()
+            await database.until_settled()
         with pytest.raises(StoreError, match="nothing was changed"):
             database.require_room()
     let_pass(database, 1)
     database.require_room()
-    await database.settled()
+    await database.until_settled()
     database.close()
     assert failures == [f"{tmp_path / 'state.db'}: writing ended: RuntimeError: unforeseen"]
     again = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
@@ -217,7 +217,7 @@ async def test_writing_continues_without_the_file_of_changes(
     monkeypatch.setattr(os, "ftruncate", broken)
     for number in range(2):
         database.put("thing", f"row {number}", number)
-        await database.settled()
+        await database.until_settled()
     assert database.query("SELECT name FROM thing") == [("row 0",), ("row 1",)]
     assert failures == [f"{tmp_path / 'state.ahead'}: [Errno 5] Input/output error"]
 
@@ -234,7 +234,7 @@ async def test_settled_statements_survive_a_power_failure(
 
     monkeypatch.setattr(os, "fsync", noted)
     database.put("thing", "revoked", 1)
-    await database.settled()
+    await database.until_settled()
     log, ahead = tmp_path / "state.db-wal", tmp_path / "state.ahead"
     assert synced == [(str(log), log.stat().st_size), (str(ahead), 0)]
 
@@ -249,10 +249,10 @@ async def test_statements_that_a_power_failure_may_undo_are_not_settled(
         disk.setattr(os, "fsync", broken)
         database.put("thing", "revoked", 1)
         with pytest.raises(StoreError, match=r"state\.db: .*Input/output error; a power failure"):
-            await database.settled()
+            await database.until_settled()
         assert failures == [f"{tmp_path / 'state.db'}: [Errno 5] Input/output error"]
         assert database.query("SELECT name FROM thing") == [("revoked",)]
-    await database.settled()
+    await database.until_settled()
 
 
 def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_rows_of_one_table_are_one_statement(
         database.delete("thing", name="row 1")
         database.put("thing", "row 2", 1)
     assert list(map(len, appended)) == [4]  # SQLite limits the number of values in one statement
-    asyncio.run(database.settled())
+    asyncio.run(database.until_settled())
     with sqlite3.connect(tmp_path / "state.db") as other:
         rows = dict(other.execute("SELECT name, size FROM thing"))
     expected = {f"row {size % 70}": size for size in range(100)} | {"row 2": 1}
@@ -495,7 +495,7 @@ def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> 
         for change in changes:
             other.execute(*Tables.statement(msgspec.msgpack.decode(change.body, type=Change)))
         query = "SELECT * FROM thing ORDER BY name"
-        asyncio.run(database.settled())
+        asyncio.run(database.until_settled())
         assert other.execute(query).fetchall() == database.query(query)
     database.close()
 
@@ -506,10 +506,10 @@ def test_a_feed_that_begins_during_a_change_has_the_whole_change(
     feeds: list[ChangeFeed] = []
 
     def late(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
-        yield from joined(changes)
+        yield from join(changes)
         feeds.append(database.follow(lambda: None, 1 << 20))
 
-    monkeypatch.setattr(writer_thread, "joined", late)
+    monkeypatch.setattr(writer_thread, "join", late)
     database.put("thing", "large", 1, ahead=False)
     changes = feeds[0].after(0, 1 << 20)
     assert changes == [Encoded(1, msgspec.msgpack.encode(Put("thing", [("large", 1)])))]
@@ -668,6 +668,6 @@ def test_a_change_is_kept_or_refused_however_it_meets_the_end(tmp_path: Path) ->
     for thread in threads:
         thread.join(30)
     with pytest.raises(StoreError, match="too late to be saved"):
-        asyncio.run(database.settled())
+        asyncio.run(database.until_settled())
     with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
         assert {name for (name,) in reader.execute("SELECT name FROM thing")} == set(kept)

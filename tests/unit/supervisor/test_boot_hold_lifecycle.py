@@ -78,7 +78,7 @@ def test_the_service_holds_until_it_serves_and_at_its_end(
     hold = RecordedHold()
     run = made(hold)
     run.put()
-    assert run.served() == ""
+    assert run.lift_hold() == ""
     run.put()
     assert hold.calls == ["put", "lift", armed, "put"]
 
@@ -124,7 +124,7 @@ async def test_other_machines_wait_until_the_robots_graph_is_taken_over() -> Non
     assert hold.calls == ["put", "put"], "the hold is restored meanwhile"
     taken.set()
     assert "another program removed the boot hold" in await keeping
-    assert run.served() == await keeping
+    assert run.lift_hold() == await keeping
     assert hold.calls == ["put", "put", "lift", (11311, "veth-rosrv", None)]
 
 
@@ -196,13 +196,13 @@ def test_a_run_without_a_hold_ends_an_earlier_one(made: Callable[[BootHold], Hol
     hold = RecordedHold()
     run = made(hold)
     run.put()
-    run.served()
+    run.lift_hold()
     assert hold.calls == ["lift", None]
 
 
 def test_a_lapsed_hold_is_an_alarm_only_if_the_robot_waited() -> None:
-    assert "served more than 60 s" in around(RecordedHold(lapsed=True), "own").served()
-    assert around(RecordedHold(lapsed=True)).served() == ""
+    assert "served more than 60 s" in around(RecordedHold(lapsed=True), "own").lift_hold()
+    assert around(RecordedHold(lapsed=True)).lift_hold() == ""
 
 
 def test_a_hold_that_fails_does_not_end_the_appliance() -> None:
@@ -211,7 +211,7 @@ def test_a_hold_that_fails_does_not_end_the_appliance() -> None:
 
 def test_a_hold_that_cannot_be_lifted_is_an_alarm_and_the_appliance_serves() -> None:
     hold = RecordedHold(broken=True)
-    assert "still held off: run `systemctl stop rosrv-hold`" in around(hold).served()
+    assert "still held off: run `systemctl stop rosrv-hold`" in around(hold).lift_hold()
     assert hold.calls == ["lift", (11311, "veth-rosrv", None)]
 
 
@@ -259,7 +259,7 @@ def test_rules_that_another_program_removed_are_restored_and_the_start_says_so()
         run.keep()
         run.keep()
         assert hold.calls == ["put", "put"]
-        assert "removed the boot hold 1 time, such as `nft flush ruleset`" in run.served()
+        assert "removed the boot hold 1 time, such as `nft flush ruleset`" in run.lift_hold()
 
 
 def test_a_hold_knows_that_its_rules_were_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

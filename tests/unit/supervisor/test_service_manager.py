@@ -37,7 +37,7 @@ def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
     }
 
     async def live(manager: ServiceManager, heard: socket.socket) -> tuple[bytes, bytes]:
-        async with manager.watched():
+        async with manager.watch():
             first = await asyncio.to_thread(heard.recv, 4096)
             manager.ready("nodes may connect")
             while not (await asyncio.to_thread(heard.recv, 4096)).startswith(b"READY=1"):

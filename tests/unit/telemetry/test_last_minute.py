@@ -30,14 +30,14 @@ def test_a_flood_holds_a_minute_of_seconds() -> None:
 def test_only_denials_count_as_denied() -> None:
     meter = Meter()
     for word in ("deny", "allow", "would deny", "ask", "deny"):
-        meter.recorded(_record("decision", word))
+        meter.count_record(_record("decision", word))
     assert meter.denied.counts() == {"publish": 2}
 
 
 def test_a_right_that_ended_does_not_count_as_a_denied_request() -> None:
     """`rosrv status` counts what `rosrv audit summary` does; a fleet's trial still sees what the robot lost."""
     meter = Meter()
-    meter.recorded(_record("revoked", "deny"))
+    meter.count_record(_record("revoked", "deny"))
     assert (meter.denied.counts(), meter.most_denied()) == ({}, "")
     assert (meter.decisions["publish", "deny"], meter.denied_hosts.counts()) == (1, {"10.0.0.5": 1})
 

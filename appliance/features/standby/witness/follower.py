@@ -148,7 +148,7 @@ class WitnessFollower:
                 self._interrupted.pop()  # the pause of a takeover
             self._epoch_admitted = self._used.epoch
         self._admitted, self._opened = "?", bool(name)
-        self._admit(name, lambda: self._left(name))
+        self._admit(name, lambda: self._seconds_left(name))
         self._admitted = name
 
     def pause(self) -> float:
@@ -172,7 +172,7 @@ class WitnessFollower:
             self._used = newest
         return self._used.holder if self._clock() < self._used.until else ""
 
-    def _left(self, name: str) -> float:
+    def _seconds_left(self, name: str) -> float:
         """Return the seconds that rules may still need until they are in force."""
         if not name:
             return EXPIRY  # to shut out is always right

@@ -60,8 +60,8 @@ def forgetting(connection: Ends) -> bytes:
     own, own_port, peer, peer_port = connection
     addresses = _attribute(1, socket.inet_aton(own)) + _attribute(2, socket.inet_aton(peer))
     ports = _attribute(2, struct.pack("!H", own_port)) + _attribute(3, struct.pack("!H", peer_port))
-    ends = _nested(1, addresses) + _nested(2, _attribute(1, struct.pack("!B", socket.IPPROTO_TCP)) + ports)
-    body = struct.pack("!BBH", socket.AF_INET, 0, 0) + _nested(1, ends)
+    ends = _nest(1, addresses) + _nest(2, _attribute(1, struct.pack("!B", socket.IPPROTO_TCP)) + ports)
+    body = struct.pack("!BBH", socket.AF_INET, 0, 0) + _nest(1, ends)
     return struct.pack("=IHHII", 16 + len(body), _CT_DELETE, _NLM_REQUEST, 0, 0) + body
 
 
@@ -77,7 +77,7 @@ def _attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(value), kind) + value + b"\0" * (-len(value) % 4)
 
 
-def _nested(kind: int, attributes: bytes) -> bytes:
+def _nest(kind: int, attributes: bytes) -> bytes:
     return _attribute(kind | 0x8000, attributes)
 
 

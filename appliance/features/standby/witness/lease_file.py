@@ -100,7 +100,7 @@ class LeaseFile:
         try:
             if self.has_room():
                 for offset in (0, _COPY):
-                    with synced(self.path, os.O_WRONLY) as descriptor:
+                    with open_synced(self.path, os.O_WRONLY) as descriptor:
                         written = os.pwrite(descriptor, copy, offset)
                         failure = UncertainError
                         if written != _COPY:
@@ -112,14 +112,14 @@ class LeaseFile:
             write_synced(new, 2 * copy)
             os.rename(new, self.path)
             failure = UncertainError
-            with synced(os.path.dirname(os.path.abspath(new)), os.O_RDONLY):
+            with open_synced(os.path.dirname(os.path.abspath(new)), os.O_RDONLY):
                 pass
         except OSError as error:
             raise failure("the lease %s cannot be saved: %s" % (self.path, error)) from error
 
 
 @contextlib.contextmanager
-def synced(path: str, flags: int) -> Iterator[int]:
+def open_synced(path: str, flags: int) -> Iterator[int]:
     """Open a file or folder, and wait at the end until its changes are on the disk."""
     descriptor = os.open(path, flags, 0o600)
     try:
@@ -130,6 +130,6 @@ def synced(path: str, flags: int) -> Iterator[int]:
 
 
 def write_synced(path: str, content: bytes) -> None:
-    with synced(path, os.O_WRONLY | os.O_CREAT) as descriptor:
+    with open_synced(path, os.O_WRONLY | os.O_CREAT) as descriptor:
         if os.write(descriptor, content) != len(content):
             raise OSError("the disk is full")

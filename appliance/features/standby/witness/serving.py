@@ -87,7 +87,7 @@ class RequestSockets:
 
     def __init__(self, listen: Tuple[str, int]) -> None:
         self._listen = listen
-        self._common = self._bound()
+        self._common = self._bind()
         self._connected = {}  # type: Dict[str, Tuple[socket.socket, Tuple[str, int]]]
 
     def __enter__(self) -> "RequestSockets":
@@ -107,7 +107,7 @@ class RequestSockets:
         before = self._connected.get(name)
         if before is not None and before[1] == source:
             return
-        one = self._bound()
+        one = self._bind()
         try:
             one.connect(source)
         except OSError:
@@ -117,7 +117,7 @@ class RequestSockets:
         if before is not None:
             before[0].close()
 
-    def _bound(self) -> socket.socket:
+    def _bind(self) -> socket.socket:
         one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             one.setsockopt(socket.SOL_IP, FREEBIND, 1)

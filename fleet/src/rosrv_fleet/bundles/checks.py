@@ -28,7 +28,7 @@ def findings_of(contents: BundleContents) -> list[str]:
         found.append(str(error))
     try:
         known = PolicyContext(hosts=hosts, cases_file="policy.ini.tests.yaml", cases=contents.cases)
-        judge(contents.policy, "policy.ini", known).accepted()
+        judge(contents.policy, "policy.ini", known).accept()
     except PolicyError as error:
         found += [str(finding) for finding in error.findings]
     try:

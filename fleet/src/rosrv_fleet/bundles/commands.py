@@ -155,7 +155,7 @@ def rotate(
 
 
 @bundle.command("list")
-def listed(repository: Repository = _HERE) -> None:
+def list_bundles(repository: Repository = _HERE) -> None:
     """List the signed bundles with their rings, and when the metadata expire.
 
     Example: rosrv-fleet bundle list

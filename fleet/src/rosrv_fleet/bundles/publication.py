@@ -53,7 +53,7 @@ def read_publication(folder: Path) -> PublishedBundles:
         root.signed.verify_delegate("targets", top.signed_bytes, top.signatures)
         bundles: dict[str, Terms] = {}
         expires = [root.signed.expires, snapshot.signed.expires, top.signed.expires]
-        for role in _delegated(top.signed):
+        for role in _delegated_roles(top.signed):
             listed = _listed(metadata, role, snapshot.signed)
             top.signed.verify_delegate(role, listed.signed_bytes, listed.signatures)
             expires.append(listed.signed.expires)
@@ -133,7 +133,7 @@ def _listed(metadata: Path, role: str, snapshot: Snapshot) -> Metadata[Targets]:
     return _load(metadata / f"{meta.version}.{role}.json", Targets)
 
 
-def _delegated(top: Targets) -> list[str]:
+def _delegated_roles(top: Targets) -> list[str]:
     return [] if top.delegations is None else list(top.delegations.roles or {})
 
 

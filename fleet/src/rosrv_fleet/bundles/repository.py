@@ -187,7 +187,7 @@ class BundleRepository:
     def delegate(self, site: str, group: str) -> None:
         role = role_of(site, group)
         top = self._open("targets", Targets)
-        if role in self._delegated(top):
+        if role in self._delegated_roles(top):
             raise RepositoryError(
                 f"{role} is delegated already; rotate its key with `rosrv-fleet bundle rotate`"
             )
@@ -258,7 +258,7 @@ class BundleRepository:
             self._save_root(root, before)
         elif role in self.roles():
             top = self._open("targets", Targets)
-            for keyid in list(self._delegated(top)[role].keyids):
+            for keyid in list(self._delegated_roles(top)[role].keyids):
                 top.revoke_key(keyid, role)
             top.add_key(self.keys.make(role), role)
             self._save("targets", top)
@@ -276,7 +276,7 @@ class BundleRepository:
     # --- queries ---
 
     def roles(self) -> list[str]:
-        return sorted(self._delegated(self._open("targets", Targets)))
+        return sorted(self._delegated_roles(self._open("targets", Targets)))
 
     def bundles(self) -> Iterator[tuple[BundlePath, TargetFile]]:
         for role in self.roles():
@@ -326,7 +326,7 @@ class BundleRepository:
     def keyids_of(self, role: str) -> list[str]:
         if role in _TOP:
             return list(self._open("root", Root).roles[role].keyids)
-        return list(self._delegated(self._open("targets", Targets))[role].keyids)
+        return list(self._delegated_roles(self._open("targets", Targets))[role].keyids)
 
     # --- reading ---
 
@@ -343,7 +343,7 @@ class BundleRepository:
         names = (_VERSIONED.fullmatch(path.name) for path in self.metadata.glob("*.json"))
         return max((int(name[1]) for name in names if name is not None and name[2] == role), default=0)
 
-    def _delegated(self, top: Targets) -> Mapping[str, DelegatedRole]:
+    def _delegated_roles(self, top: Targets) -> Mapping[str, DelegatedRole]:
         return {} if top.delegations is None or top.delegations.roles is None else top.delegations.roles
 
     def _require_role(self, site: str, group: str) -> str:

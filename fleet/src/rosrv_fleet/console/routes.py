@@ -377,7 +377,7 @@ Word = Annotated[str, PathParameter(max_length=63)]
 def console_router(collector: Collector) -> APIRouter:
     router = APIRouter(include_in_schema=False)
 
-    def shown(request: Request, title: str, body: Callable[[OperatorToken], str]) -> Response:
+    def show(request: Request, title: str, body: Callable[[OperatorToken], str]) -> Response:
         holder = collector.tokens.holder(request.cookies.get(COOKIE, ""))
         if holder is None:
             return RedirectResponse("/login", 303, HEADERS)
@@ -393,7 +393,7 @@ def console_router(collector: Collector) -> APIRouter:
             raise RolloutRefusedError(_NO_BUNDLES)
         return collector.bundles
 
-    def known(site: str, group: str) -> RobotGroup:
+    def known_group(site: str, group: str) -> RobotGroup:
         place = bundles().group(site, group)
         if place not in bundles().robots and place not in bundles().rollouts:
             raise RolloutRefusedError(
@@ -403,34 +403,32 @@ def console_router(collector: Collector) -> APIRouter:
 
     @router.get("/")
     def robots(request: Request) -> Response:
-        return shown(
-            request, "Robots", lambda _holder: robots_page(collector, _asked(request, FLEET_FILTERS))
-        )
+        return show(request, "Robots", lambda _holder: robots_page(collector, _query(request, FLEET_FILTERS)))
 
     @router.get("/search")
     def search(request: Request) -> Response:
-        return shown(
-            request, "Search", lambda viewer: search_page(collector, viewer.name, _asked(request, ASKED))
+        return show(
+            request, "Search", lambda viewer: search_page(collector, viewer.name, _query(request, ASKED))
         )
 
     @router.get("/evidence")
     def evidence(request: Request) -> Response:
         def body(holder: OperatorToken) -> str:
-            asked = _asked(request, BUNDLE_FILTERS)
+            asked = _query(request, BUNDLE_FILTERS)
             return evidence_page(collector, asked, may_get=holder.may(FleetRole.OPERATOR))
 
-        return shown(request, "Evidence", body)
+        return show(request, "Evidence", body)
 
     @router.get("/rollouts")
     def groups(request: Request) -> Response:
-        return shown(request, "Rollouts", lambda _holder: groups_page(bundles()))
+        return show(request, "Rollouts", lambda _holder: groups_page(bundles()))
 
     @router.get("/rollouts/{site}/{group}")
     def one_group(request: Request, site: Word, group: Word) -> Response:
         def body(holder: OperatorToken) -> str:
-            return group_page(bundles(), known(site, group), may_change=holder.may(FleetRole.OPERATOR))
+            return group_page(bundles(), known_group(site, group), may_change=holder.may(FleetRole.OPERATOR))
 
-        return shown(request, f"Rollouts of {site}/{group}", body)
+        return show(request, f"Rollouts of {site}/{group}", body)
 
     @router.get("/rollouts/{site}/{group}/{act}")
     def confirm(request: Request, site: Word, group: Word, act: Act) -> Response:
@@ -439,12 +437,12 @@ def console_router(collector: Collector) -> APIRouter:
             return _forbidden(holder)
 
         def body(_holder: OperatorToken) -> str:
-            stored = bundles().rollouts.get(known(site, group))
+            stored = bundles().rollouts.get(known_group(site, group))
             if stored is None:
                 raise RolloutRefusedError(f"there was no rollout of {site}/{group}")
-            return confirm_page(known(site, group), act, stored)
+            return confirm_page(known_group(site, group), act, stored)
 
-        return shown(request, f"Rollouts of {site}/{group}: {act}", body)
+        return show(request, f"Rollouts of {site}/{group}: {act}", body)
 
     @router.post("/rollouts/{site}/{group}/{act}")
     async def carry_out(request: Request, site: Word, group: Word, act: Act) -> Response:
@@ -458,7 +456,7 @@ def console_router(collector: Collector) -> APIRouter:
         title, number = f"Rollouts of {site}/{group}", given.get("number", "")
         try:
             change = bundles().stop if act == "stop" else bundles().revert
-            await change(known(site, group), holder.name, int(number) if number.isdecimal() else -1)
+            await change(known_group(site, group), holder.name, int(number) if number.isdecimal() else -1)
         except RolloutRefusedError as error:
             return page(title, f"<h1>Not done</h1>{alert(str(error))}", holder, 409)
         except (DatabaseError, OSError) as error:
@@ -503,7 +501,7 @@ def _session_router(tokens: OperatorTokens) -> APIRouter:
     return router
 
 
-def _asked(request: Request, names: tuple[str, ...]) -> dict[str, str]:
+def _query(request: Request, names: tuple[str, ...]) -> dict[str, str]:
     return {name: request.query_params.get(name, "").strip()[:1024] for name in names}
 
 

@@ -70,7 +70,7 @@ class _RobotVerifier(Verifier):
         if _LOG.fullmatch(log) is None:
             raise ValueError(f"{log[:80]!a} is not the id of a log")
         with contextlib.suppress(OSError, zlib.error, ValueError):  # `verify` reports it
-            places: list[SegmentPlace] = self._store.numbered(self._robot.name, log, number)
+            places: list[SegmentPlace] = self._store.with_number(self._robot.name, log, number)
             ends = [self._store.header(place).end for place in places]
             ends.sort(key=lambda end: end.hash != given["hash"])  # of a fork, one history is enough
             self.copies = {(self.manifest["log"], end.number): [msgspec.to_builtins(end)] for end in ends[:1]}
@@ -99,17 +99,17 @@ def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceC
         raise EvidenceError(str(error)) from None
     except Exception as error:  # noqa: BLE001  the file may contain anything
         reason = f"it is not an evidence bundle: {type(error).__name__} {error}"
-        raise EvidenceError(*_bounded([reason])) from None
+        raise EvidenceError(*_limit([reason])) from None
     if verifier.findings:
-        raise EvidenceError("; ".join(_bounded(verifier.findings)))
+        raise EvidenceError("; ".join(_limit(verifier.findings)))
     return EvidenceContent(
         log=about.log, since=about.since, until=about.until, recording=about.recording,
         records=sum(last - first + 1 for first, last in about.runs), checkpoints=verifier.checkpoints,
-        collected=verifier.agreeing, unproven=_bounded(verifier.notes),
+        collected=verifier.agreeing, unproven=_limit(verifier.notes),
     )  # fmt: skip
 
 
-def _bounded(sentences: list[str]) -> list[str]:
+def _limit(sentences: list[str]) -> list[str]:
     first = [printable(sentence[:_LONGEST_SENTENCE]) for sentence in sentences[:_MAX_SENTENCES]]
     others = len(sentences) - len(first)
     return [*first, *([f"{others} more"] if others else [])]

@@ -20,7 +20,7 @@ from rosrv_fleet.collector import Collector
 from rosrv_fleet.enrolment import EnrolmentError, Robot
 from rosrv_fleet.evidence.check import EvidenceError, check_evidence
 from rosrv_fleet.evidence.store import BUNDLE, StoredEvidence
-from rosrv_fleet.robots import recorded
+from rosrv_fleet.robots import record_act
 from rosrv_fleet.segment_store import StoreFullError
 from rosrv_fleet.tokens import FleetRole
 
@@ -49,14 +49,14 @@ def evidence_router(collector: Collector) -> APIRouter:
         if found is None:
             raise HTTPException(404, f"no evidence bundle {evidence}; list them: rosrv-fleet evidence list")
         path, name = collector.evidence.path(evidence), f"{found.robot}-{evidence[:12]}.zip"
-        with recorded(collector.config.data, "evidence get", found.robot, evidence, operator):
+        with record_act(collector.config.data, "evidence get", found.robot, evidence, operator):
             return FileResponse(path, media_type="application/zip", filename=name)
 
     @router.post("")
     async def add(request: Request, operator: Operator, robot: RobotName) -> Response:
         """Verify and store a bundle (ZIP) of a robot; 200 instead of 201 if it was stored before."""
         try:
-            found, is_new = await additions.add(request, collector.robots.named(robot), operator)
+            found, is_new = await additions.add(request, collector.robots.require(robot), operator)
         except EnrolmentError as error:
             raise HTTPException(404, str(error)) from error
         except EvidenceError as error:

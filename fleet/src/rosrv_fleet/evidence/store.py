@@ -15,7 +15,7 @@ import structlog
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import write_whole
-from rosrv_fleet.robots import make_folder, recorded
+from rosrv_fleet.robots import make_folder, record_act
 from rosrv_fleet.segment_store import DamagedFileError, read_stored, sync
 
 BUNDLE = "bundle.zip"
@@ -78,7 +78,7 @@ class EvidenceStore:
         bundle.chmod(0o400)
         sync(bundle)
         write_whole(upload / _ABOUT, msgspec.json.encode(about), 0o400)
-        with recorded(self._folder.parent, "evidence add", about.robot, about.id, about.by):
+        with record_act(self._folder.parent, "evidence add", about.robot, about.id, about.by):
             upload.rename(self._folder / about.id)
             sync(self._folder)
 
@@ -86,7 +86,7 @@ class EvidenceStore:
         about = self.get(evidence) if _ID.fullmatch(evidence) else None
         if about is not None:
             removed = self.incoming()  # a killed command leaves it there
-            with recorded(self._folder.parent, "evidence remove", about.robot, evidence):
+            with record_act(self._folder.parent, "evidence remove", about.robot, evidence):
                 (self._folder / evidence).rename(removed / evidence)
                 sync(self._folder)
             shutil.rmtree(removed)

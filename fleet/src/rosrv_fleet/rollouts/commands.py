@@ -61,7 +61,7 @@ def start(
         "healthy_seconds": healthy,
         "ring_seconds": ring_within,
     }
-    _show(_asked("POST", "", collector, ca, token_file, {"bundle": bundle, "gates": gates}))
+    _show(_ask("POST", "", collector, ca, token_file, {"bundle": bundle, "gates": gates}))
 
 
 @rollout.command()
@@ -70,7 +70,7 @@ def status(collector: Url, ca: Authority = None, token_file: Token = NO_TOKEN, a
 
     Example: rosrv-fleet rollout status
     """
-    body = _asked("GET", "", collector, ca, token_file)
+    body = _ask("GET", "", collector, ca, token_file)
     if as_json:
         say_json(body)
     else:
@@ -88,7 +88,7 @@ def stop(place: Place, collector: Url, ca: Authority = None, token_file: Token =
 
     Example: rosrv-fleet rollout stop site-a/arms
     """
-    _show(_asked("POST", f"/{place}/stop", collector, ca, token_file))
+    _show(_ask("POST", f"/{place}/stop", collector, ca, token_file))
 
 
 @rollout.command()
@@ -97,10 +97,10 @@ def revert(place: Place, collector: Url, ca: Authority = None, token_file: Token
 
     Example: rosrv-fleet rollout revert site-a/arms
     """
-    _show(_asked("POST", f"/{place}/revert", collector, ca, token_file))
+    _show(_ask("POST", f"/{place}/revert", collector, ca, token_file))
 
 
-def _asked(  # noqa: PLR0917  a request and its connection
+def _ask(  # noqa: PLR0917  a request and its connection
     method: str, path: str, url: str, ca: Path | None, token_file: Path, body: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     with answer_to(

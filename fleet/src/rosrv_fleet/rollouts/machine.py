@@ -110,7 +110,7 @@ def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
     return ""
 
 
-def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
+def target(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
     """Return the bundle that a robot should have, or "". After a stop, robots with the new one in force keep it.
 
     No robot moves back to `before` because the next rollout starts.
@@ -135,18 +135,18 @@ def kept_after(rollout: BundleRollout) -> set[str]:
     return {*kept_by(rollout), rollout.path} if rollout.state == "stopped" else set()
 
 
-def advanced(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
+def advance(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
     if rollout.state != "running":
         return rollout
     if rollout.ring < 0:
         return _open(rollout, robots, now)
     unhealthy_ring = _unhealthy_ring(rollout, robots, now)
     if unhealthy_ring:
-        return _stopped(rollout, unhealthy_ring)
+        return _stop(rollout, unhealthy_ring)
     missing = _not_taken(rollout, robots)
     if missing:
         if now - rollout.opened > rollout.gates.ring_seconds:
-            return _stopped(rollout, f"{missing}, after {rollout.gates.ring_seconds:g} s")
+            return _stop(rollout, f"{missing}, after {rollout.gates.ring_seconds:g} s")
         return msgspec.structs.replace(rollout, healthy=None, why=missing)
     return _healthy(rollout, robots, now)
 
@@ -164,17 +164,17 @@ def _healthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float
     return _open(since, robots, now)
 
 
-def stopped(rollout: BundleRollout, why: str) -> BundleRollout:
-    return _stopped(rollout, why) if rollout.state == "running" else rollout
+def stop(rollout: BundleRollout, why: str) -> BundleRollout:
+    return _stop(rollout, why) if rollout.state == "running" else rollout
 
 
-def reverted(rollout: BundleRollout, why: str) -> BundleRollout:
+def revert(rollout: BundleRollout, why: str) -> BundleRollout:
     if rollout.state == "reverted":
         return rollout
     return msgspec.structs.replace(rollout, state="reverted", healthy=None, why=why)
 
 
-def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
+def resume(rollout: BundleRollout, seconds: float) -> BundleRollout:
     """Start the times of all gates again after `seconds` in which the collector heard no robot."""
     if rollout.state != "running":
         return rollout
@@ -223,7 +223,7 @@ def _open(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -
     if not fresh and (index == 0 or any(seen.seen for seen in members.values())):
         why = f"ring {rollout.terms.rings[index].name} has no robot that reports"
         if index == 0 and now - max(rollout.started, rollout.opened, earliest) > rollout.gates.ring_seconds:
-            return _stopped(rollout, f"{why}, after {rollout.gates.ring_seconds:g} s")
+            return _stop(rollout, f"{why}, after {rollout.gates.ring_seconds:g} s")
         return msgspec.structs.replace(rollout, why=why)
     return msgspec.structs.replace(
         rollout,
@@ -304,5 +304,5 @@ def _not_taken(rollout: BundleRollout, robots: Mapping[str, RobotSeen]) -> str:
     return ""
 
 
-def _stopped(rollout: BundleRollout, why: str) -> BundleRollout:
+def _stop(rollout: BundleRollout, why: str) -> BundleRollout:
     return msgspec.structs.replace(rollout, state="stopped", healthy=None, why=why)

@@ -65,7 +65,7 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
     async def one(site: str, group: str, _who: reader) -> dict[str, Any]:
         """Return a group's last rollout, its robots and its earlier rollouts."""
         place = _group(service, site, group)
-        history = await _answered(asyncio.to_thread(service.store.history, place, _HISTORY))
+        history = await _answer(asyncio.to_thread(service.store.history, place, _HISTORY))
         robots, conditions = service.robots.get(place, {}), service.conditions(place)
         return group_state(service, place) | {
             "robots": [
@@ -88,21 +88,21 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
             path = BundlePath.parse(body.bundle)
         except TermsError as error:
             raise HTTPException(422, str(error)) from error
-        await _answered(service.start(path, HealthGates(**body.gates.model_dump()), who))
+        await _answer(service.start(path, HealthGates(**body.gates.model_dump()), who))
         return group_state(service, RobotGroup(path.site, path.group))
 
     @router.post("/{site}/{group}/stop")
     async def stop(site: str, group: str, who: changer) -> dict[str, Any]:
         """Stop the running rollout: no other robot gets the bundle."""
         place = _group(service, site, group)
-        await _answered(service.stop(place, who))
+        await _answer(service.stop(place, who))
         return group_state(service, place)
 
     @router.post("/{site}/{group}/revert")
     async def revert(site: str, group: str, who: changer) -> dict[str, Any]:
         """Give all robots the bundle that preceded the last rollout."""
         place = _group(service, site, group)
-        await _answered(service.revert(place, who))
+        await _answer(service.revert(place, who))
         return group_state(service, place)
 
     return router
@@ -140,7 +140,7 @@ def _group(service: BundleService, site: str, group: str) -> RobotGroup:
         raise HTTPException(422, str(error)) from error
 
 
-async def _answered(work: Any) -> Any:
+async def _answer(work: Any) -> Any:
     try:
         return await work
     except RolloutRefusedError as error:

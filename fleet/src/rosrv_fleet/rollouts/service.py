@@ -34,7 +34,7 @@ from rosrv_fleet.rollouts.machine import (
     HealthGates,
     OperatorAct,
     RobotSeen,
-    selected,
+    target,
     unhealthy,
 )
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
@@ -72,7 +72,7 @@ def conditions(
     silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
     found = {}
     for robot, seen in robots.items():
-        wanted = "" if rollout is None else selected(rollout, robot, seen)
+        wanted = "" if rollout is None else target(rollout, robot, seen)
         if not seen.seen:
             found[robot] = RobotCondition(ConditionKind.NEVER_SEEN, "it never reported")
         elif now - seen.seen > silent and robot in off:
@@ -86,11 +86,11 @@ def conditions(
         elif wanted and seen.in_force != wanted:
             found[robot] = RobotCondition(ConditionKind.BEHIND, seen.trouble[:200] or f"{wanted} is selected")
         else:
-            found[robot] = _settled(seen)
+            found[robot] = _condition(seen)
     return found
 
 
-def _settled(seen: RobotSeen) -> RobotCondition:
+def _condition(seen: RobotSeen) -> RobotCondition:
     if not seen.in_force:
         return RobotCondition(ConditionKind.NO_BUNDLE)
     return RobotCondition(
@@ -259,11 +259,11 @@ class BundleService:
         stored = self.rollouts.get(group)
         if stored is None:
             return ""
-        chosen = machine.selected(stored.rollout, robot, self.robots.get(group, {}).get(robot))
+        chosen = machine.target(stored.rollout, robot, self.robots.get(group, {}).get(robot))
         return chosen if chosen in self.publisher.bundles else ""
 
     async def report(self, robot: str, group: RobotGroup, report: RobotReport) -> None:
-        seen = _checked(report, self._clock())
+        seen = _check(report, self._clock())
         await asyncio.to_thread(self.store.save_report, robot, group, seen)
         self._arrived[robot] = StoredReport(group, seen)
         if robot in self.robots.get(group, {}):
@@ -335,7 +335,7 @@ class BundleService:
 
     async def stop(self, group: RobotGroup, who: str, number: int | None = None) -> StoredRollout:
         def stop(rollout: BundleRollout) -> BundleRollout:
-            return self._by(machine.stopped(rollout, f"stopped by {who}"), rollout, who, "stop")
+            return self._by(machine.stop(rollout, f"stopped by {who}"), rollout, who, "stop")
 
         return await self._change(group, stop, number)
 
@@ -351,7 +351,7 @@ class BundleService:
                 raise RolloutRefusedError(
                     f"{rollout.before} is withdrawn: add a bundle with its content, and roll that out"
                 )
-            return self._by(machine.reverted(rollout, f"reverted by {who}"), rollout, who, "revert")
+            return self._by(machine.revert(rollout, f"reverted by {who}"), rollout, who, "revert")
 
         return await self._change(group, back, number)
 
@@ -412,7 +412,7 @@ class BundleService:
         self._deaf = (heard, now - heard)
         _log.warning("no robot was heard, because the collector was away", seconds=round(now - heard))
         for group, stored in list(self.rollouts.items()):
-            await self._save(group, stored, machine.resumed(stored.rollout, now - heard), now)
+            await self._save(group, stored, machine.resume(stored.rollout, now - heard), now)
 
     async def _change(
         self, group: RobotGroup, change: Callable[[BundleRollout], BundleRollout], number: int | None
@@ -443,9 +443,9 @@ class BundleService:
         for group, stored in list(self.rollouts.items()):
             published = self.publisher.publication
             if published is not None and stored.rollout.path not in published.bundles:
-                rollout = machine.stopped(stored.rollout, f"{stored.rollout.path} was withdrawn")
+                rollout = machine.stop(stored.rollout, f"{stored.rollout.path} was withdrawn")
             else:
-                rollout = machine.advanced(stored.rollout, self._heard(group), now)
+                rollout = machine.advance(stored.rollout, self._heard(group), now)
             await self._save(group, stored, rollout, now)
 
     async def _save(
@@ -477,7 +477,7 @@ def _by_group(
     return found
 
 
-def _checked(report: RobotReport, now: float) -> RobotSeen:
+def _check(report: RobotReport, now: float) -> RobotSeen:
     for path in filter(None, (report.in_force, report.trying, report.refused)):
         try:
             BundlePath.parse(path)

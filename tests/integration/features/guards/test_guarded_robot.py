@@ -10,7 +10,7 @@ import pytest
 
 from appliance.features.guards.presets import PRESETS, Preset
 from appliance.features.guards.released import FOLDER as RELEASED
-from appliance.features.guards.released import released
+from appliance.features.guards.released import released_preset
 from benchmarks.published_stop import busy_programs
 from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
@@ -24,7 +24,7 @@ OLDER = [
     (row, preset)
     for row in ROWS
     for path in sorted(RELEASED.glob(f"{row.preset}-*.rv"))
-    if (preset := released(row.preset, int(path.stem.rpartition("-")[2]))).version
+    if (preset := released_preset(row.preset, int(path.stem.rpartition("-")[2]))).version
     < PRESETS[row.preset].version
 ]
 

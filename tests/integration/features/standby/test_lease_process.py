@@ -69,7 +69,7 @@ class Site:
 
     def _run(self) -> None:
         async def work() -> None:
-            process: Any = LeaseProcess.opened(MEMBERSHIP, self._lifeline.detach(), self.epoch)
+            process: Any = LeaseProcess.open(MEMBERSHIP, self._lifeline.detach(), self.epoch)
             try:
                 await process.run()
             finally:  # a real process ends here

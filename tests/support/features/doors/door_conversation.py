@@ -57,7 +57,7 @@ from roswire.tcpros import Body
 from roswire.xmlrpc import MethodCall, Value
 from tests.support.features.doors.door_world import DoorWorld, WebSocketClient
 
-DEFINITIONS = standard_definitions().extended(
+DEFINITIONS = standard_definitions().merge(
     Definitions.from_files({"own/Load.msg": "geometry_msgs/Point32 at\nfloat32 weight"})
 )
 _SETTLED = 0.2  # s
@@ -228,7 +228,7 @@ class DoorConversation:
                 definitions = DEFINITIONS
                 if text != values:
                     definitions = Definitions.from_full_text(kind, text.replace("|", "\n"))
-                made = MessageType.defined(definitions, kind)
+                made = MessageType.of(definitions, kind)
                 publication = await node.advertise(resource, made, latched=latched, queue=100)
                 known = KnownTypes(definitions, ValueLimits()).message(kind)
                 self._published[name, resource] = publication, known
@@ -270,7 +270,7 @@ class DoorConversation:
                 raise ServiceFailedError(values.removeprefix("fails "))
             return response.codec.writer.from_json(values.encode(), (7, 8))
 
-        await node.offer(service, ServiceType.defined(DEFINITIONS, kind), answer)
+        await node.offer(service, ServiceType.of(DEFINITIONS, kind), answer)
 
     async def _call(self, node: RosNode, service: str, kind: str, values: str) -> None:
         request, response, _ = _TYPES.service(kind)

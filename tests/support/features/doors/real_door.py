@@ -43,7 +43,7 @@ async def real_door(
     )
     await node.start()
     defined = standard_definitions()
-    types = KnownTypes(defined.extended(definitions) if definitions else defined, ValueLimits())
+    types = KnownTypes(defined.merge(definitions) if definitions else defined, ValueLimits())
     door, lookout = assembled_door(
         node, types, most_topics=2000, calls=DoorMemory().client(), hosts=_no_hosts
     )

@@ -229,7 +229,7 @@ class NightRobot:
     def _sign(self, number: int, text: bytes, *, oldest: bool) -> None:
         if self.signs:
             self._notary.sign(text)
-            self.log.signed(number, self._key.sign(text), self._public)
+            self.log.store_signature(number, self._key.sign(text), self._public)
 
     def _approve(self, number: int, checkpoint: bytes, newest: bytes) -> None:
         try:

@@ -8,7 +8,7 @@ from rosbags.typesys import get_types_from_msg
 from appliance.features.guards.presets import DRIVER_CHECK, Guard, Preset, preset_named, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.fast.abi import SetPart
-from rosmop.fast.build import certified, parts_of
+from rosmop.fast.build import certify, parts_of
 from rosmop.fast.serialization import decoded_part
 from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.run.engine import MonitorSet
@@ -21,7 +21,7 @@ Change = Callable[[str], str]
 Value = bool | int | float | str
 MONITORS = ROOT / "monitors"
 _TRIGGER = "landshark_msgs/PaintballTrigger.msg"
-DEFINITIONS = standard_definitions().extended(
+DEFINITIONS = standard_definitions().merge(
     Definitions.from_files({_TRIGGER: (MONITORS / "msg" / _TRIGGER).read_text(encoding="utf-8")})
 )
 """The types of the guards, and those of the shipped monitors."""
@@ -64,7 +64,7 @@ def part_of(*texts: str) -> SetPart:
     """Return the part with the guards of these texts, in this order."""
     sources = {f"guard{number or ''}.rv": text for number, text in enumerate(texts)}
     compiled = compiled_from(sources, DEFINITIONS, lints=False)
-    [part] = parts_of(certified(compiled).data, [([one.name for one in compiled.specifications], ())])
+    [part] = parts_of(certify(compiled).data, [([one.name for one in compiled.specifications], ())])
     return decoded_part(part)
 
 

@@ -38,10 +38,10 @@ async def main() -> None:
             change_randomly(active.database, chosen)
         mark += 1
         active.database.put("mark", mark)
-        await active.sender.acknowledged(active.database.number)
+        await active.sender.until_acknowledged(active.database.number)
         _report(mark)
-    await active.sender.acknowledged(active.database.number)
-    await active.database.settled()
+    await active.sender.until_acknowledged(active.database.number)
+    await active.database.until_settled()
     _report("equal")
 
 

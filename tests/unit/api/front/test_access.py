@@ -216,7 +216,7 @@ def test_a_neighbour_without_a_token_keeps_no_known_credential_out() -> None:
         def opened(ticket: str) -> int:
             target = f"/door/pad?ticket={ticket}".encode()
             try:
-                gate.admit_websocket("10.0.0.1", "/door/", tickets.shown(target))
+                gate.admit_websocket("10.0.0.1", "/door/", tickets.digest_of(target))
             except ProblemError as problem:
                 return problem.status
             return 101

@@ -77,7 +77,7 @@ async def test_each_question_gets_its_own_answer(link: ControlLink, there: Contr
         there.channel.send(
             RequestAnswered(made.number, encode(AdminAnswer(True, example(Status, probe=made.shown))))
         )
-    assert [(await one).given().probe for one in asked] == ["who0", "who1", "who2"]
+    assert [(await one).unwrap().probe for one in asked] == ["who0", "who1", "who2"]
 
 
 async def test_a_question_ends_with_the_link_or_the_timeout(

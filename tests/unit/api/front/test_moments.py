@@ -4,7 +4,7 @@ import jsonschema_rs
 import msgspec
 import pytest
 
-from appliance.api.front.moments import describe, given, in_full
+from appliance.api.front.moments import describe, in_full, parse_moment
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.routing import CONTRACT
 from appliance.channel.answers.field_docs import UNIT, Moment, NanoMoment, doc
@@ -73,6 +73,6 @@ def test_an_answer_without_times_is_not_walked() -> None:
 
 
 def test_an_invalid_time_is_a_problem_with_a_hint() -> None:
-    assert given("2026-11-20T06:20:46.123456789Z") == 1_795_155_646_123_456_789
+    assert parse_moment("2026-11-20T06:20:46.123456789Z") == 1_795_155_646_123_456_789
     with pytest.raises(ProblemError, match="2026-03-01T12:00:00Z"):
-        given("tomorrow")
+        parse_moment("tomorrow")

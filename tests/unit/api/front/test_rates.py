@@ -28,5 +28,5 @@ def test_memory_is_bounded(peers: list[int]) -> None:
     hosts = [f"10.0.{peer // 256}.{peer % 256}" for peer in peers]
     for second, host in enumerate(hosts):
         buckets.take(host, float(second))
-    remembered = sum(buckets.touched(host, float(len(hosts))) for host in set(hosts))
+    remembered = sum(buckets.is_touched(host, float(len(hosts))) for host in set(hosts))
     assert remembered == min(16, len(set(hosts)))

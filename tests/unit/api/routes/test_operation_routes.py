@@ -23,7 +23,7 @@ from appliance.channel.messages.api import RequestMade
 from appliance.channel.operations import CHANGES, OPERATIONS
 from appliance.channel.operations import REQUESTS as REQUESTS_OF_CONTROL
 from appliance.channel.rest_bodies import DATED
-from appliance.channel.rest_meaning import call_of, filled_in, meant
+from appliance.channel.rest_meaning import call_of, filled_in, order_of
 from appliance.channel.rest_operation import Operation, extra_of, plain
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.errors import SenselessError, TokenRefusedError, UnknownThingError
@@ -225,7 +225,7 @@ def test_the_api_and_control_understand_the_same(method: str, target: str, body:
     made = ordered(method, target, body, tag)
     assert made.asked is not None
     assert (made.asked.method, made.asked.target) == (method, target)
-    assert filled_in(meant(made.asked), made.request) == made.request
+    assert filled_in(order_of(made.asked), made.request) == made.request
 
 
 MATRIX = [
@@ -577,7 +577,7 @@ def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any
             made.request, **{field.name: _other(getattr(made.request, field.name))}
         )
         filled = field.name == "request" and body.get("request") is None
-        assert (filled_in(meant(made.asked), other) == other) is filled, field.name
+        assert (filled_in(order_of(made.asked), other) == other) is filled, field.name
 
 
 def _other(value: Any) -> Any:

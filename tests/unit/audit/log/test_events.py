@@ -1,7 +1,7 @@
 import pytest
 
 from appliance.audit.log.events import EVENTS, SEVERITIES
-from distribution.generated_pages import uses, written, written_by
+from distribution.generated_pages import recorded_events, uses, written_by
 
 
 def test_every_recorded_event_is_registered() -> None:
@@ -11,7 +11,7 @@ def test_every_recorded_event_is_registered() -> None:
 
 
 def test_every_documented_event_is_recorded_somewhere() -> None:
-    assert EVENTS.keys() - written() == set()
+    assert EVENTS.keys() - recorded_events() == set()
 
 
 @pytest.mark.parametrize(

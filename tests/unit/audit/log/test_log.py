@@ -492,7 +492,7 @@ def test_an_unsigned_log_is_degraded_and_not_flooded(
         if isinstance(answer, str):
             log.refused(number, answer)
         elif answer is not None:
-            log.signed(number, *answer)
+            log.store_signature(number, *answer)
 
     def work(minutes: int) -> None:
         for number in range(minutes):

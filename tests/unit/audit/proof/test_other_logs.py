@@ -49,7 +49,7 @@ class Machine:
                 memory.accept(text)
                 if others:
                     running[0].other_logs(memory.others(text))
-                running[0].signed(number, self.key.sign(text), public)
+                running[0].store_signature(number, self.key.sign(text), public)
 
         log = AuditLog(self.path, drive=ByHand, checkpoint_every=5, signer=sign)
         running.append(log)

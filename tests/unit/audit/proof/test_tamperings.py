@@ -54,7 +54,7 @@ def _machine(folder: Path, time: VirtualClock) -> Machine:
     def sign(number: int, text: bytes, *, oldest: bool) -> None:
         del oldest
         memory.accept(text)
-        logs[-1].signed(number, key.sign(text), public)
+        logs[-1].store_signature(number, key.sign(text), public)
 
     log = AuditLog(path, drive=ByHand, checkpoint_every=_SEGMENT, checkpoint_seconds=3600, signer=sign)
     logs.append(log)

@@ -81,7 +81,7 @@ def test_a_first_signature_during_the_verification_has_its_key(
 
     def sign(*arguments: Any, **options: Any) -> Any:
         for number, text in asked:
-            log.signed(number, key.sign(text), key.public_key().public_bytes_raw())
+            log.store_signature(number, key.sign(text), key.public_key().public_bytes_raw())
         settle(log)
         assert signed_checkpoints(path)
         return usual(*arguments, **options)

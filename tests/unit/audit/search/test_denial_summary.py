@@ -9,7 +9,7 @@ from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.audit.log.record_format import LogEntry, rfc3339
 from appliance.audit.log.repetition import ALL, ALL_UNKNOWN, HOST, KIND, OTHERS, UNKNOWN
 from appliance.audit.search import denial_summary
-from appliance.audit.search.denial_summary import CountedName, DenialSummary, summarised, summary_of_log
+from appliance.audit.search.denial_summary import CountedName, DenialSummary, summarise, summary_of_log
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export
 from appliance.base import clock
@@ -46,7 +46,7 @@ def folded(scope: str, host: str | None, count: int, **more: object) -> AuditRec
 
 
 def of(*records: AuditRecord, limit: int = 10) -> DenialSummary:
-    return summarised([LogEntry(place, record) for place, record in enumerate(records)][::-1], limit)
+    return summarise([LogEntry(place, record) for place, record in enumerate(records)][::-1], limit)
 
 
 def test_the_host_with_the_most_denials_is_first() -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.log.record_format import LogEntry, rfc3339
 from appliance.audit.log.repetition import KIND, new_state, summary
-from appliance.audit.search.equality import equal_key, equality_of, grouped, times
+from appliance.audit.search.equality import equal_key, equality_of, group_equal, times
 
 
 def _drop(reason: str = "limit.drive dropped it: speed 0.4", **fields: Any) -> AuditRecord:
@@ -40,7 +40,7 @@ def test_a_flood_is_one_row_with_the_first_record_and_the_last_value() -> None:
         _drop("limit.drive dropped it: speed 0.45"),
     )
     for entries in (log, log[::-1]):
-        [row] = grouped(entries)
+        [row] = group_equal(entries)
         assert (row.first.sequence, row.last.sequence, row.records, row.count) == (1, 3, 3, 10)
         assert row.value == "limit.drive dropped it: speed 0.45"
 
@@ -52,11 +52,11 @@ def test_a_count_without_a_reason_continues_its_records() -> None:
         _drop("limit.drive dropped it: speed 2"),
     )
     for entries in (log, log[::-1]):
-        [row] = grouped(entries)
+        [row] = group_equal(entries)
         assert (row.count, row.value) == (10, "limit.drive dropped it: speed 2")
     first, more, _ = log
     other = LogEntry(9, _drop("limit.arm dropped it"))
-    assert [row.count for row in grouped([more, first, other])] == [9, 1]
+    assert [row.count for row in group_equal([more, first, other])] == [9, 1]
 
 
 @pytest.mark.parametrize(
@@ -75,25 +75,25 @@ def test_records_that_differ_in_more_than_values_are_not_equal(other: dict[str, 
 
 def test_actions_for_one_message_do_not_break_the_row() -> None:
     pair = [_drop(), _drop("speed 4", event="monitor log")]
-    assert [row.count for row in grouped(_log(*pair * 5))] == [5, 5]
-    assert [row.count for row in grouped(_log(*pair * 2, _deny(), *pair))] == [2, 2, 1, 1, 1]
+    assert [row.count for row in group_equal(_log(*pair * 5))] == [5, 5]
+    assert [row.count for row in group_equal(_log(*pair * 2, _deny(), *pair))] == [2, 2, 1, 1, 1]
 
 
 def test_decisions_keep_their_order() -> None:
     allow = _deny(decision="allow")
-    assert [row.count for row in grouped(_log(_deny(), _deny(), allow, _deny()))] == [2, 1, 1]
+    assert [row.count for row in group_equal(_log(_deny(), _deny(), allow, _deny()))] == [2, 1, 1]
 
 
 def test_a_summary_of_repetitions_continues_its_record() -> None:
     state = new_state(_deny(), KIND)
     for _ in range(4):
         state.count_in(_deny())
-    [row] = grouped(_log(_deny(), summary(state, "1" * 20, 1)))
+    [row] = group_equal(_log(_deny(), summary(state, "1" * 20, 1)))
     assert (row.count, row.first.record.event, row.value) == (5, "decision", "no rule")
     ended = equality_of(row.last.record)["ended"]
     assert ended == rfc3339(_deny().time) != rfc3339(row.last.record.time), "the count was recorded later"
     many = summary(new_state(_deny(), "host"), "1" * 20, 1)
-    assert len(grouped(_log(_deny(), many))) == 2
+    assert len(group_equal(_log(_deny(), many))) == 2
 
 
 def test_a_number_of_records_is_not_a_number_of_repetitions() -> None:
@@ -116,6 +116,6 @@ _CHOICE = st.sampled_from(
 def test_no_record_is_lost(records: list[AuditRecord], newest_first: bool) -> None:
     numbers = count(1)
     log = [LogEntry(next(numbers), record) for record in records]
-    rows = grouped(log[::-1] if newest_first else log)
+    rows = group_equal(log[::-1] if newest_first else log)
     assert sum(row.records for row in rows) == len(records)
     assert sum(row.count for row in rows) == sum(times(record) for record in records)

@@ -54,7 +54,7 @@ async def test_calls_are_overdue_while_one_waits_and_none_is_answered() -> None:
             await due.wait()
         return b"!"
 
-    call = answering.watched(answer)
+    call = answering.watch(answer)
     let_time_pass(60.0)
     assert answering.overdue() == 0.0
     slow = asyncio.ensure_future(call(HttpRequest(peer, "/", b"slow", 0)))

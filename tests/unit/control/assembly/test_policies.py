@@ -278,7 +278,7 @@ async def test_a_reload_overtaken_by_another_change_is_refused(
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         slow = Slow(monkeypatch, appliance)
-        await policies.store.settled()
+        await policies.store.until_settled()
         loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
         await policies.rollback(1, who="not confirmed in time")

@@ -20,7 +20,7 @@ def silence(store: StateStore, ends: EndTable) -> Ending:
     handled = HandledAlarms(store, ends)
     return Ending(
         lambda seconds: handled.silence("rosmaster", "ann", "", seconds),
-        lambda: bool(handled.marked(example(Status)).handled_alarms),
+        lambda: bool(handled.with_marks(example(Status)).handled_alarms),
     )
 
 

@@ -37,14 +37,14 @@ async def test_a_disabled_monitor_is_an_alarm_once(tmp_path: Path) -> None:
     looks = watch(core, off)
     looks.look(3000.0)
     assert [row.forgotten for row in looks.rows()] == [False, False]
-    await core.store.settled()
+    await core.store.until_settled()
     looks = watch(core, off)
     looks.look(700.0)
     assert recorded(core) == [
         "protection forgotten: monitor a is disabled for more than 1.0 h: rosrv monitor enable a",
         "protection forgotten: monitor b is in shadow mode for more than 1.0 h: rosrv monitor enforce b",
     ]
-    await core.store.settled()
+    await core.store.until_settled()
     looks = watch(core, off)
     looks.look(9000.0)
     assert len(recorded(core)) == 2

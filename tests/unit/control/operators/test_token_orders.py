@@ -76,7 +76,7 @@ async def test_an_announced_token_stays(lives: Lives) -> None:
     tokens = lives.next()
     text = await tokens.first()
     tokens.first_token_shown()
-    await lives.store.settled()
+    await lives.store.until_settled()
     later = lives.next()
     assert await later.first() is None
     assert opens(later, text)
@@ -103,7 +103,7 @@ async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: 
         raise StoreError("the disk is full")
 
     with monkeypatch.context() as patched:
-        patched.setattr(lives.store, "settled", full)
+        patched.setattr(lives.store, "until_settled", full)
         with pytest.raises(StoreError, match="full"):
             await tokens.add(TokenAdd("alice", "admin", 60))
     assert tokens.usable() == []
@@ -149,7 +149,7 @@ async def test_the_list_shows_an_end_as_the_door_judges_it(lives: Lives) -> None
     await tokens.add(TokenAdd("bob", "viewer", 7200))
     let_time_pass(3601)
     set_wall(wall() - 86_400)
-    assert {row.name: row.valid for row in (await tokens.listed(TokenList())).tokens} == {
+    assert {row.name: row.valid for row in (await tokens.list_tokens(TokenList())).tokens} == {
         "alice": False,
         "bob": True,
     }
@@ -174,7 +174,7 @@ async def test_only_a_valid_token_can_be_rotated(lives: Lives) -> None:
     for name in ("bob", "carol", "dave", "x" * 500):
         with pytest.raises(TokenRefusedError, match=r"that is valid; there are: alice$"):
             await tokens.rotate(TokenRotate(name))
-    assert len((await tokens.listed(TokenList())).tokens) == 3
+    assert len((await tokens.list_tokens(TokenList())).tokens) == 3
 
 
 @pytest.mark.parametrize(
@@ -208,7 +208,7 @@ async def test_a_rotation_that_cannot_be_stored_leaves_the_earlier_token(
         raise StoreError("the disk is full")
 
     with monkeypatch.context() as patched:
-        patched.setattr(lives.store, "settled", full)
+        patched.setattr(lives.store, "until_settled", full)
         with pytest.raises(StoreError, match="full"):
             await tokens.rotate(TokenRotate("alice"))
     assert [one.id for one in tokens.usable()] == [old.id]
@@ -226,7 +226,7 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
         await tokens.revoke(TokenRevoke("alice"))
         raise StoreError("the disk is full")
 
-    monkeypatch.setattr(lives.store, "settled", revoked_meanwhile)
+    monkeypatch.setattr(lives.store, "until_settled", revoked_meanwhile)
     with pytest.raises(StoreError, match="full"):
         await tokens.rotate(TokenRotate("alice"))
     assert tokens.usable() == []
@@ -236,7 +236,7 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
 async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
-    await lives.store.settled()
+    await lives.store.until_settled()
     assert lives.log.close() is None  # a thread in SQLite would leave its locks to the child
     child = os.fork()
     if not child:
@@ -275,14 +275,14 @@ async def _rotate_and_die(lives: Lives) -> None:
     async def killed() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
-    store.settled = killed  # type: ignore[method-assign]  # killed instead of answering
+    store.until_settled = killed  # type: ignore[method-assign]  # killed instead of answering
     trail = AuditTrail(lives.log, strict=False, deny_when_failed=False)
     lives.log.record = lambda record: record.id  # type: ignore[method-assign]  # its thread is in the parent
     await TokenOrders(store, trail, ends_of(store, lives.home), lambda: None).rotate(TokenRotate("alice"))
 
 
 async def uses(tokens: TokenOrders) -> dict[str, float | None]:
-    return {token.name: token.last_used for token in (await tokens.listed(TokenList())).tokens}
+    return {token.name: token.last_used for token in (await tokens.list_tokens(TokenList())).tokens}
 
 
 async def test_the_last_use_survives_a_restart(lives: Lives) -> None:
@@ -294,10 +294,10 @@ async def test_the_last_use_survives_a_restart(lives: Lives) -> None:
     known = await uses(tokens)
     assert known["alice"] == pytest.approx(wall())
     assert known["bob"] is None
-    listed = await tokens.listed(TokenList())
+    listed = await tokens.list_tokens(TokenList())
     again = lives.next()
     assert await uses(again) == known
-    assert (await again.listed(TokenList())).uses_since == listed.uses_since
+    assert (await again.list_tokens(TokenList())).uses_since == listed.uses_since
 
 
 async def test_uses_are_stored_at_most_once_in_half_a_minute(

@@ -190,7 +190,7 @@ async def test_answers_are_in_order_with_their_numbers(world: Everything, api: A
         api.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN))
     heard = await api.until(4)
     assert [one.number for one in heard[1:]] == [7, 3, 9]
-    assert [answer_of(one).given().nodes for one in heard[1:]] == [1, 2, 3]
+    assert [answer_of(one).unwrap().nodes for one in heard[1:]] == [1, 2, 3]
     assert [who for _request, who in world.asked] == ["w", "alice", "w"]
 
 

@@ -256,7 +256,7 @@ class RobotWorld:
         return {entry for node in self.robot.values() if node.alive for entry in node.entries()}
 
     def adopted(self) -> set[Entry]:
-        return {entry for entry, _node in self.graph.held()}
+        return {entry for entry, _node in self.graph.all_registrations()}
 
     # --- what the operation uses ---
 

@@ -185,7 +185,7 @@ def test_a_robot_that_was_never_adopted_is_released_without_a_wait(
         return GiveBackReport() if isinstance(request, ReleaseOrder) else AdminAnswer(False, error="down")
 
     monkeypatch.setattr("os.geteuid", lambda: 0)
-    monkeypatch.setattr(release_verb, "ordered", lambda _state, _order: nullcontext())
+    monkeypatch.setattr(release_verb, "show_order", lambda _state, _order: nullcontext())
     monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
     release_verb.release.function(call_of(answer), dead=False, force=False, within=1.0)
     assert capsys.readouterr().out == "nothing is adopted: nodes that use this appliance go on using it\n"
@@ -238,7 +238,7 @@ def test_a_release_names_the_rules_that_still_close_the_nodes(
     as_json: bool,
 ) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 0)
-    monkeypatch.setattr(release_verb, "ordered", lambda _state, _order: nullcontext())
+    monkeypatch.setattr(release_verb, "show_order", lambda _state, _order: nullcontext())
     monkeypatch.setattr(release_verb, "remove_drop_ins", lambda: None)
     monkeypatch.setattr(close_ports, "is_applied", lambda: closed)
     with pytest.raises(Exit) if status and not as_json else nullcontext():

@@ -12,7 +12,7 @@ from appliance.features.adopt import machine_side
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
 from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
 from appliance.features.adopt.machine_side import AdoptWork, wanted_record
-from appliance.features.adopt.operator_orders import ADOPT, RELEASE, ordered
+from appliance.features.adopt.operator_orders import ADOPT, RELEASE, show_order
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings, LinkAddresses
 from appliance.network.namespaces import Namespace, NetworkError
@@ -81,35 +81,35 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_an_adoption_and_a_release_need_an_operators_order_each(machine: Machine) -> None:
     with pytest.raises(ValueError, match="no operator ordered an adoption"):
         machine.order("want", wanted=True)
-    with ordered(machine.state, ADOPT):
+    with show_order(machine.state, ADOPT):
         machine.order("want", wanted=True)
     assert (machine.record.wanted, machine.record.unit) == (True, "roscore.service")
     for phase in (Phase.TAKING, Phase.TAKEN):
         machine.order("phase", phase=phase)
     with pytest.raises(ValueError, match="no operator ordered a release"):
         machine.order("want", wanted=False)
-    with ordered(machine.state, RELEASE):
+    with show_order(machine.state, RELEASE):
         machine.order("want", wanted=False)
     assert not machine.record.wanted
 
 
 def test_an_order_is_used_once_and_for_two_minutes(machine: Machine) -> None:
     machine.begin(Phase.TAKEN)
-    with ordered(machine.state, RELEASE):
+    with show_order(machine.state, RELEASE):
         machine.time.advance(121.0)
         with pytest.raises(ValueError, match="no operator"):
             machine.order("want", wanted=False)
-    with ordered(machine.state, RELEASE):
+    with show_order(machine.state, RELEASE):
         machine.order("want", wanted=False)
         machine.begin(Phase.TAKEN)
         with pytest.raises(ValueError, match="no operator"):
             machine.order("want", wanted=False)
-    with ordered(machine.state, ADOPT), pytest.raises(ValueError, match="no operator"):
+    with show_order(machine.state, ADOPT), pytest.raises(ValueError, match="no operator"):
         machine.order("want", wanted=False)
 
 
 def test_an_adoption_that_fails_is_undone_without_another_order(machine: Machine) -> None:
-    with ordered(machine.state, ADOPT):
+    with show_order(machine.state, ADOPT):
         machine.order("want", wanted=True)
     machine.order("phase", phase=Phase.TAKING)
     machine.order("want", wanted=False)

@@ -822,7 +822,7 @@ async def test_nothing_waits_for_a_master_that_is_not_there(world: RobotWorld) -
 async def test_a_name_held_by_the_appliance_is_never_taken(world: RobotWorld) -> None:
     await world.until_settled()
     assert all(not node.own for node in world.graph.nodes())
-    assert not list(world.parts.registry.registered(Kind.PUBLICATION, "/rosout_agg"))
+    assert not list(world.parts.registry.registrants(Kind.PUBLICATION, "/rosout_agg"))
 
 
 async def taken_again(world: RobotWorld) -> None:

@@ -29,7 +29,7 @@ class Robot:
     def restart(self) -> None:
         self.core.restart()
         handled = HandledAlarms(self.core.store, self.core.ends)
-        alarms = Alarms(lambda: handled.marked(example(Status, **self.fields)), handled)
+        alarms = Alarms(lambda: handled.with_marks(example(Status, **self.fields)), handled)
         self.orders = AlarmOrders(alarms, self.core.trail)
 
     @property
@@ -37,7 +37,7 @@ class Robot:
         return [f"{row['event']} by {row['who']}: {row['reason']}" for row in self.core.trail.rows]
 
     def alarms(self) -> list[Alarm]:
-        return asyncio.run(self.orders.listed(AlarmsWanted())).alarms
+        return asyncio.run(self.orders.list_alarms(AlarmsWanted())).alarms
 
     def silence(self, seconds: float | None) -> None:
         asyncio.run(self.orders.silence(AlarmSilence("rosmaster", seconds), "ann"))

@@ -109,7 +109,7 @@ class Site:
         return self.orders.hold_call(decision.asks or Request(AGENT, "", category, "")).text
 
     async def held(self) -> list[Approval]:
-        return (await self.orders.listed(ApprovalsWanted())).approvals
+        return (await self.orders.list_approvals(ApprovalsWanted())).approvals
 
 
 @pytest.fixture

@@ -39,7 +39,7 @@ def state(tmp_path: Path) -> Path:
 
     def sign(number: int, text: bytes, *, oldest: bool = True) -> None:
         memory.accept(text)
-        logs[0].signed(number, key.sign(text), key.public_key().public_bytes_raw())
+        logs[0].store_signature(number, key.sign(text), key.public_key().public_bytes_raw())
 
     logs: list[AuditLog] = []
     logs.append(open_log(state / "control" / "audit.db", checkpoint_every=5, signer=sign))
@@ -117,7 +117,7 @@ def test_a_restored_log_is_signed_on(tmp_path: Path, before: int, step: int) -> 
 
         def sign(number: int, text: bytes, **_: object) -> None:
             memory.accept(text)
-            logs[-1].signed(number, key.sign(text), key.public_key().public_bytes_raw())
+            logs[-1].store_signature(number, key.sign(text), key.public_key().public_bytes_raw())
 
         logs.append(open_log(state / "control" / "audit.db", checkpoint_seconds=3600, signer=sign))
         logs[-1].request_signatures()
@@ -307,7 +307,7 @@ def test_a_name_that_cannot_be_restored_is_refused(state: Path, tmp_path: Path, 
 def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = state / "api" / "growing"
     content.write_bytes(bytes(1000))
-    opened = backup.opened
+    opened = backup.open_file
 
     def grown(state: Path, name: str) -> int | None:
         descriptor = opened(state, name)
@@ -315,7 +315,7 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
             monkeypatch.setattr(backup, "LARGEST", 999)
         return descriptor
 
-    monkeypatch.setattr(backup, "opened", grown)
+    monkeypatch.setattr(backup, "open_file", grown)
     require_refused(state, tmp_path, r"api/growing has more than 999 bytes: find out its origin")
 
 
@@ -369,13 +369,13 @@ def test_a_signal_leaves_no_file(
 
 
 def test_nohup_protects_a_backup(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened = backup.opened
+    opened = backup.open_file
 
     def hung_up(state: Path, name: str) -> int | None:
         signal.raise_signal(signal.SIGHUP)
         return opened(state, name)
 
-    monkeypatch.setattr(backup, "opened", hung_up)
+    monkeypatch.setattr(backup, "open_file", hung_up)
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         assert back_up(state, tmp_path / "backup.tar.gz")
@@ -426,7 +426,7 @@ def test_a_database_replaced_by_a_link_reveals_nothing_of_root(
         connection.execute("CREATE TABLE secret (value TEXT)")
         connection.commit()
     secret.chmod(0o600)
-    opened = backup.opened
+    opened = backup.open_file
 
     def swapped(state: Path, name: str) -> int | None:
         descriptor = opened(state, name)
@@ -435,6 +435,6 @@ def test_a_database_replaced_by_a_link_reveals_nothing_of_root(
             (state / name).symlink_to(secret)
         return descriptor
 
-    monkeypatch.setattr(backup, "opened", swapped)
+    monkeypatch.setattr(backup, "open_file", swapped)
     require_refused(owned, tmp_path, r"control/state\.db cannot be read by its owner, user id 61011")
     assert os.geteuid() == 0

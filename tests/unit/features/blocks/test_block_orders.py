@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from appliance.base import clock
-from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.base.withdrawal import WithdrawnError, withdrawable
 from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
@@ -80,7 +80,7 @@ class Control(ControlParts):
         return (await self.orders.unblock(HostUnblock(address), "ann")).restored
 
     async def blocked(self) -> list[str]:
-        return [row.address for row in (await self.orders.listed(HostBlocks())).blocks]
+        return [row.address for row in (await self.orders.list_blocks(HostBlocks())).blocks]
 
     def denial(self, host: str, text: str = "") -> str | None:
         decision = self.current.decide(Request(address_of(host), "/node", Category.PUBLISH, "/scan"))
@@ -167,7 +167,7 @@ async def test_a_registration_that_is_under_way_during_the_block_ends(made: Cont
 
 async def test_an_order_whose_client_gave_up_changes_nothing(made: Control) -> None:
     await made.block(OTHER)
-    with awaited(lambda: True):
+    with withdrawable(lambda: True):
         with pytest.raises(WithdrawnError):
             await made.block(NODE)
         with pytest.raises(WithdrawnError):
@@ -200,7 +200,7 @@ async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path
     async with control(tmp_path) as made:
         await until(lambda: made.denial(OTHER) is None)
         assert (made.denial(NODE) or "").startswith(f"{NODE} is blocked by ann until")
-        [row] = (await made.orders.listed(HostBlocks())).blocks
+        [row] = (await made.orders.list_blocks(HostBlocks())).blocks
         assert (row.address, row.note) == (NODE, "a")
         assert row.until is not None
         assert abs(row.until - (clock.wall() + 3539)) < 30
@@ -223,7 +223,7 @@ async def test_spellings_and_names_of_a_host_are_one_block(made: Control) -> Non
     assert await made.blocked() == [NODE, "fd00::1", "fe80::1", "10.99.0.2"]
     assert (made.denial("10.99.0.2") or "").startswith("10.99.0.2 is blocked")
     assert (made.denial(f"::ffff:{NODE}") or "").startswith(f"{NODE} is blocked")
-    assert (await made.orders.listed(HostBlocks())).blocks[-1].name == "ocu-1"
+    assert (await made.orders.list_blocks(HostBlocks())).blocks[-1].name == "ocu-1"
     await made.unblock("ocu-1")
     await made.unblock("fd00:0::1")
     assert await made.blocked() == [NODE, "fe80::1"]
@@ -336,7 +336,7 @@ async def test_a_block_that_is_not_stored_is_in_force_and_says_so(
         raise StoreError("state.db: no space left")
 
     async with control(tmp_path) as made:
-        monkeypatch.setattr(made.state, "settled", full)
+        monkeypatch.setattr(made.state, "until_settled", full)
         with pytest.raises(StoreError, match="is blocked now, but a stop of the appliance ends it"):
             await made.block(NODE)
         assert made.denial(NODE) is not None
@@ -377,11 +377,11 @@ async def test_the_callers_own_way_in_is_blocked_only_by_force(made: Control, ad
     made.remotes = {"ocu-1": NODE}
     for dry_run in (True, False):
         with (
-            awaited(lambda: False, f"::ffff:{NODE}"),
+            withdrawable(lambda: False, f"::ffff:{NODE}"),
             pytest.raises(HostRefusedError, match="your own requests come from"),
         ):
             await made.block(address, dry_run=dry_run)
     await made.block(address, dry_run=True)  # on the admin socket, which stays open
-    with awaited(lambda: False, NODE):
+    with withdrawable(lambda: False, NODE):
         assert (await made.block(address, force=True)).address in (NODE, "10.99.0.2")
         await made.block(OTHER)

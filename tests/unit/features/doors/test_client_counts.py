@@ -2,7 +2,7 @@ from websockets.server import ServerProtocol
 
 from appliance.base import clock
 from appliance.features.doors.door_link import MAX_SHOWN
-from appliance.features.doors.process import SAMPLE_SECONDS, CountedClient, shown
+from appliance.features.doors.process import SAMPLE_SECONDS, CountedClient, describe_clients
 from appliance.features.doors.session import DoorSession
 from tests.support.idle import idle
 from tests.support.virtual_clock import VirtualClock
@@ -22,6 +22,6 @@ def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
         for client in clients:
             client.sample()
     session.sent += 7
-    first = next(shown(reversed(clients)))
+    first = next(describe_clients(reversed(clients)))
     assert (first.peer, first.received, first.sent, first.refusals) == ("10.0.0.0", 55, 7, 0)
-    assert len([*shown(clients)]) == MAX_SHOWN
+    assert len([*describe_clients(clients)]) == MAX_SHOWN

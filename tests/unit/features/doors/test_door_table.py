@@ -23,16 +23,16 @@ def test_a_name_keeps_its_address_and_no_other_name_gets_it(tmp_path: Path) -> N
     store = opened(tmp_path)
     table = DoorTable(store, Doors())
     for name in ("alice", "bob"):
-        table.save(table.planned(name, None, ""))
+        table.save(table.plan(name, None, ""))
     alice = table.of("alice")
     table.remove("alice")
     table.closed = ""
     assert [*table.addresses()] == ["door:bob"]
     again = DoorTable(store, Doors())
-    new = again.planned("carol", 9091, "10.0.0.7")
+    new = again.plan("carol", 9091, "10.0.0.7")
     assert new.address not in {alice.address, again.of("bob").address, Doors().gateway}
     assert new.slot == alice.slot
-    assert again.planned("alice", None, "").address == alice.address
+    assert again.plan("alice", None, "").address == alice.address
     assert not again.addresses()  # until the firewall reserves the network
     again.closed = ""
     assert [*again.addresses()] == ["door:bob"]
@@ -41,7 +41,7 @@ def test_a_name_keeps_its_address_and_no_other_name_gets_it(tmp_path: Path) -> N
     assert "door bob has the address" in moved.problem
     assert not moved.addresses()
     with pytest.raises(SenselessError, match="keeps its earlier address"):
-        moved.planned("alice", None, "")
+        moved.plan("alice", None, "")
     moved.remove("bob")
     assert moved.problem == ""
 
@@ -62,9 +62,9 @@ def test_a_door_that_would_confuse_is_refused(
     tmp_path: Path, name: str, port: int | None, source: str, words: str
 ) -> None:
     table = DoorTable(opened(tmp_path), Doors())
-    table.save(table.planned("agent-1", 9091, ""))
+    table.save(table.plan("agent-1", 9091, ""))
     with pytest.raises(SenselessError, match=words):
-        table.planned(name, port, source)
+        table.plan(name, port, source)
     with pytest.raises(UnknownThingError, match="agent-1"):
         table.of(name if name != "agent-1" else "nobody")
 
@@ -72,10 +72,10 @@ def test_a_door_that_would_confuse_is_refused(
 def test_doors_are_bounded(tmp_path: Path) -> None:
     table = DoorTable(opened(tmp_path), Doors())
     for number in range(MAX_DOORS):
-        table.save(table.planned(f"d{number}", None, ""))
+        table.save(table.plan(f"d{number}", None, ""))
     assert sorted(row.slot or 0 for row in table.live()) == [*range(MAX_DOORS)]
     with pytest.raises(SenselessError, match="limit"):
-        table.planned("more", None, "")
+        table.plan("more", None, "")
 
 
 def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:

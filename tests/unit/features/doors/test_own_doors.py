@@ -38,7 +38,7 @@ def test_a_token_has_the_door_of_its_name_and_a_person_that_of_a_group(
 ) -> None:
     table = DoorTable(StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase), Doors())
     for name in ("alice", "agent-1", "bob", "floor"):
-        table.save(table.planned(name, None, ""))
+        table.save(table.plan(name, None, ""))
     found = OwnDoors(table, lambda: PEOPLE).of(who)
     assert found.name == door
     assert reason in found.reason
@@ -57,10 +57,10 @@ def test_a_visit_is_one_connection_and_ends_with_its_token(tmp_path: Path) -> No
         visits.opened(row.id)
         assert visits.find("alice", text) is None
         machine.advance(86_400.0)
-        assert visits.ended() == []
+        assert visits.pop_ended() == []
         bearers.clear()
         bearers["2"] = "alice"
-        assert visits.ended() == [(row, False)]
+        assert visits.pop_ended() == [(row, False)]
         assert visits.present("alice") == []
 
 
@@ -72,14 +72,14 @@ def test_an_unused_ticket_is_over_after_a_minute_whatever_the_clock_says(tmp_pat
         machine.set_wall(1_789_990_000.0)
         machine.advance(61.0)
         assert visits.find("alice", text) is None
-        assert visits.ended() == [(row, False)]
+        assert visits.pop_ended() == [(row, False)]
 
 
 def test_visits_of_a_person_are_bounded_and_only_their_door_reports_their_end(tmp_path: Path) -> None:
     with clock.using(VirtualClock()):
         visits = DoorVisits(ends_in(tmp_path), lambda: {"1": "alice"})
         rows = [visits.make("alice", "alice")[0] for _ in range(10)]
-        assert visits.ended() == [(row, True) for row in rows[:2]]
+        assert visits.pop_ended() == [(row, True) for row in rows[:2]]
         visits.left("bob", rows[2].id)
         visits.left("alice", rows[3].id)
         assert visits.present("alice") == [rows[2], *rows[4:]]

@@ -40,11 +40,11 @@ async def offers_late(node: RosNode, service: str, kind: str, seconds: float = 3
         await asyncio.sleep(seconds)
         return b""
 
-    await node.offer(service, ServiceType.defined(standard_definitions(), kind), answer)
+    await node.offer(service, ServiceType.of(standard_definitions(), kind), answer)
 
 
 async def talks(node: RosNode, topic: str, *, latched: bool = False) -> Any:
-    kind = MessageType.defined(standard_definitions(), "std_msgs/String")
+    kind = MessageType.of(standard_definitions(), "std_msgs/String")
     return await node.advertise(topic, kind, latched=latched, queue=100)
 
 
@@ -594,7 +594,7 @@ async def test_two_spellings_of_a_topic_both_get_its_messages(world: DoorWorld) 
 async def test_a_denial_of_the_policy_before_is_asked_about_again(world: DoorWorld) -> None:
     world.master.answers["getSystemState"] = [[["/load", ["/robot"]]], [], []]
     world.master.answers["getTopicTypes"] = [["/load", "own/Load"]]
-    own = MessageType.defined(Definitions.from_files({"own/Load.msg": "float32 weight"}), "own/Load")
+    own = MessageType.of(Definitions.from_files({"own/Load.msg": "float32 weight"}), "own/Load")
     await (await world.robot("10.0.0.3", "/robot")).advertise("/load", own, latched=False, queue=10)
     world.master.denials["registerSubscriber"] = "denied by [Subscribers]"
 

@@ -19,12 +19,12 @@ FORGED = "int64 forged"
 
 
 def standard() -> Definitions:
-    return standard_definitions().extended(Definitions.from_files(OWN))
+    return standard_definitions().merge(Definitions.from_files(OWN))
 
 
 async def publishes(robot: RosNode, topic: str, name: str, text: str = "") -> Any:
     definitions = Definitions.from_full_text(name, text) if text else standard()
-    return await robot.advertise(topic, MessageType.defined(definitions, name), latched=False, queue=10)
+    return await robot.advertise(topic, MessageType.of(definitions, name), latched=False, queue=10)
 
 
 async def call(client: WebSocketClient, service: str, args: Any = None) -> Any:
@@ -61,7 +61,7 @@ async def calls_a_service_of_ros(_world: DoorWorld, client: WebSocketClient, rob
         heard.append(body)
         return b"\x01\0\0\0\0"
 
-    await robot.offer("/set", ServiceType.defined(standard(), "std_srvs/SetBool"), answer)
+    await robot.offer("/set", ServiceType.of(standard(), "std_srvs/SetBool"), answer)
     answered = await call(client, "/set", {"data": True})
     assert (answered["result"], heard) == (True, [b"\x01"])
     assert answered["values"] == {"success": True, "message": ""}
@@ -87,7 +87,7 @@ async def publishes_a_type_of_ros(world: DoorWorld, client: WebSocketClient, rob
     await robot.subscribe(
         "/cmd",
         lambda body, _header: heard.append(body),
-        MessageType.defined(standard(), "geometry_msgs/Twist"),
+        MessageType.of(standard(), "geometry_msgs/Twist"),
     )
     twist = {"linear": {"x": 1.0}}
     client.send({"op": "advertise", "topic": "/cmd", "type": "geometry_msgs/Twist", "will": twist})

@@ -35,7 +35,7 @@ def rosbags() -> Typestore:
 
 
 def codec(text: str, limits: ValueLimits = LIMITS) -> MessageCodec:
-    return MessageCodec(standard().extended(Definitions.from_files({"t/T.msg": text})), "t/T", limits)
+    return MessageCodec(standard().merge(Definitions.from_files({"t/T.msg": text})), "t/T", limits)
 
 
 def written(text: str, json: str) -> bytes:
@@ -183,7 +183,7 @@ def test_values_that_do_not_fit_are_an_error_with_the_path(text: str, given: str
         "t/Row.msg": "float32[1] f",
         "t/Wide.msg": "uint8[4000] b",
     }
-    made = MessageCodec(standard().extended(Definitions.from_files(types)), "t/T", LIMITS)
+    made = MessageCodec(standard().merge(Definitions.from_files(types)), "t/T", LIMITS)
     with pytest.raises(MessageValueError) as caught:
         made.writer.from_json(given.encode(), NOW)
     assert "t/T: " in str(caught.value) and error in str(caught.value)
@@ -273,7 +273,7 @@ def test_the_scan_accepts_what_cbor2_writes_for_plain_values() -> None:
 def test_the_cost_of_a_text_is_an_upper_bound_of_the_memory_that_it_takes(text: str, unit: str) -> None:
     point, row = "float64 x\nfloat64 y\nfloat64[9] z\nstring s", "int32[] b"
     files = {"t/T.msg": text, "t/P.msg": point, "t/L.msg": row}
-    definitions = standard().extended(Definitions.from_files(files))
+    definitions = standard().merge(Definitions.from_files(files))
     writer = MessageCodec(definitions, "t/T", ValueLimits()).writer
     sent = f'{{"a":[{",".join([unit] * min(20_000, 3_000_000 // len(unit)))}]}}'.encode()
     writer.from_json(sent, NOW)

@@ -743,10 +743,10 @@ def test_columns_are_packed_as_in_the_log() -> None:
     numbers = [sign * (2**power + step) for power in range(63) for step in (-1, 0, 1) for sign in (-1, 1)]
     values = [None, *texts, *(text.encode() for text in texts), *NUMBERS, *numbers, -(2**63), 2**64 - 1]
     for value in values:
-        assert bundle_verifier.packed(value) == msgspec.msgpack.encode(value), repr(value)[:50]
+        assert bundle_verifier.pack(value) == msgspec.msgpack.encode(value), repr(value)[:50]
     with pytest.raises(StopIteration):
-        bundle_verifier.packed(2**64)
-    assert struct.unpack(">b", bundle_verifier.packed(-32)) == (-32,)
+        bundle_verifier.pack(2**64)
+    assert struct.unpack(">b", bundle_verifier.pack(-32)) == (-32,)
 
 
 def test_the_verifier_runs_on_python_3_8() -> None:

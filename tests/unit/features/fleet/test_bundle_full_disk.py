@@ -17,7 +17,7 @@ async def test_a_bundle_that_a_full_disk_rolled_back_is_not_in_force_and_is_trie
     wait: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = BundleRobot(tmp_path)
-    save, settled = robot.store.save_setting, robot.store.settled
+    save, settled = robot.store.save_setting, robot.store.until_settled
     is_trial: list[bool] = []
     waits = iter([StoreError(_FULL) if wait == number else None for number in (1, 2)])
 
@@ -31,7 +31,7 @@ async def test_a_bundle_that_a_full_disk_rolled_back_is_not_in_force_and_is_trie
         await settled()
 
     monkeypatch.setattr(robot.store, "save_setting", noted)
-    monkeypatch.setattr(robot.store, "settled", full_once)
+    monkeypatch.setattr(robot.store, "until_settled", full_once)
     robot.policies.change("olga")
     robot.monitors.change("olga")
     async with robot.running():

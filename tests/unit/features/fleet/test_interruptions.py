@@ -25,7 +25,7 @@ def site(tmp_path: Path) -> Iterator[tuple[RobotSite, str]]:
 
 def poll(robot: VerifiedBundles) -> str:
     robot.refresh()
-    selected = robot.selected()
+    selected = robot.fetch_selected()
     assert selected is not None
     return str(robot.get(selected).path)
 

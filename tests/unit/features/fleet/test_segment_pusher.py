@@ -62,7 +62,7 @@ class Collector(CollectorConnection):
         self.pushed.append(int(number))
         fields: dict[str, Any] = {"robot": "arm1", "log": log, "number": int(number), "segment": name}
         fields |= {"first": before + 1, "last": end, "time": 1}
-        return msgspec.json.encode(SegmentReceipt(**fields | self.changes).signed(self.key))
+        return msgspec.json.encode(SegmentReceipt(**fields | self.changes).sign(self.key))
 
     def close(self) -> None: ...
 

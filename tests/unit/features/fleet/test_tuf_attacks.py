@@ -42,7 +42,7 @@ class Field:
     def poll(self, robot: VerifiedBundles | None = None) -> VerifiedBundle | None:
         asker = robot or self.robot
         asker.refresh()
-        selected = asker.selected()
+        selected = asker.fetch_selected()
         return None if selected is None else asker.get(selected)
 
     def give(self, path: str, body: bytes | None) -> None:

@@ -76,7 +76,7 @@ class Guarded:
         return () if outcome.result == "dropped" else legs_of(bytes(outcome.buffer))
 
     def receive(self, outcome: Outcome, at: int) -> None:
-        self.got += [(at, bytes(one.data)) for one in outcome.sent()]
+        self.got += [(at, bytes(one.data)) for one in outcome.sent_messages()]
 
 
 def seeded(seed: int) -> random.Random:

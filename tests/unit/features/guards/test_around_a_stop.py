@@ -37,7 +37,7 @@ def come_into_force(preset: str, how: str) -> MonitorSet:
 def stops(monitors: MonitorSet, first: int, last: int) -> list[bytes]:
     """Return what the guard sends between two times in milliseconds."""
     outcomes = [one for at in range(first, last, 10) for one in monitors.advance(BEGIN + at * MS)]
-    return [bytes(sent.data) for outcome in outcomes for sent in outcome.sent()]
+    return [bytes(sent.data) for outcome in outcomes for sent in outcome.sent_messages()]
 
 
 @pytest.mark.parametrize(("preset", "how"), CASES)

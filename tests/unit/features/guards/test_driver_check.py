@@ -83,7 +83,7 @@ async def test_the_line_of_the_monitor_is_the_outcome(
     assert not site.removed() and not site.trail.records
     site.says(f"driver check: {outcome} after {seconds:.3f} s")
     await site.checks.look()
-    found = await site.checks.wanted(DriverCheckWanted())
+    found = await site.checks.check_drivers(DriverCheckWanted())
     assert (found.outcome, found.seconds, status_of(found.outcome)) == (outcome, seconds, status)
     assert site.removed()
     [row] = site.trail.rows
@@ -95,7 +95,7 @@ async def test_its_monitor_is_removed_before_the_client_reads_the_outcome(site: 
     await site.checks.begin(BEGIN, "eve")
     site.says("driver check: idle after 30.000 s")
     assert not site.removed()
-    assert (await site.checks.wanted(DriverCheckWanted())).outcome == "idle"
+    assert (await site.checks.check_drivers(DriverCheckWanted())).outcome == "idle"
     assert site.removed()
     assert site.monitors.confirm_by is None
 
@@ -131,7 +131,7 @@ async def relay_dies(site: Site) -> None:
 async def no_line(site: Site) -> None:
     for _second in range(45):
         let_time_pass(1)
-        await site.checks.wanted(DriverCheckWanted())
+        await site.checks.check_drivers(DriverCheckWanted())
 
 
 async def removed(site: Site) -> None:
@@ -154,14 +154,14 @@ async def test_a_disturbed_check_ends_and_its_monitor_is_removed(site: Site, dis
     await disturb(site)
     await site.checks.look()
     assert site.removed()
-    found = await site.checks.wanted(DriverCheckWanted())
+    found = await site.checks.check_drivers(DriverCheckWanted())
     assert found.outcome == "interrupted" and why in found.text and status_of(found.outcome) == 2
 
 
 async def test_a_control_that_starts_removes_the_monitor_of_the_last_one(site: Site) -> None:
     await site.checks.begin(BEGIN, "eve")
     again = Site(site.monitors)
-    assert (await again.checks.wanted(DriverCheckWanted())).command == ""
+    assert (await again.checks.check_drivers(DriverCheckWanted())).command == ""
     await again.checks.look()
     assert site.removed() and not again.trail.records
     assert site.monitors.confirm_by is None  # else all changes of the next minutes would be undone
@@ -197,7 +197,7 @@ async def test_a_check_that_is_refused_does_not_begin(site: Site, monkeypatch: p
     site.refuse(monkeypatch, "load", 1)
     with pytest.raises(SpecificationsRefusedError):
         await site.checks.begin(BEGIN, "eve")
-    assert (await site.checks.wanted(DriverCheckWanted())).command == ""
+    assert (await site.checks.check_drivers(DriverCheckWanted())).command == ""
 
 
 async def test_a_check_in_shadow_mode_does_not_begin(tmp_path: Path) -> None:

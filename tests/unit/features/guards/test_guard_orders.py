@@ -26,9 +26,9 @@ from appliance.features.guards.guard_facts import values_of
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.guard_words import state_in_words, times_in_words
 from appliance.features.guards.presets import PRESETS, Guard, former_guard, text_of
-from appliance.features.guards.released import released
+from appliance.features.guards.released import released_preset
 from appliance.features.guards.robot_graph import GOAL
-from appliance.features.guards.upgrades import upgraded
+from appliance.features.guards.upgrades import upgrade_of
 from appliance.features.guards.view import GUARDS_VIEW, ActingGuard, GuardsState
 from appliance.specifications.specification_files import MonitorsChangedError, SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
@@ -387,7 +387,7 @@ async def test_a_plan_says_what_a_change_would_do(
     def refused(*_judged: object, **_named: object) -> None:
         raise refusal
 
-    monkeypatch.setattr(monitors.judge, "judged", refused)
+    monkeypatch.setattr(monitors.judge, "judge", refused)
     plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
     assert plan.refused == ([] if not loads and "enforce" not in request_ else refusal.findings)
     assert monitors.tag == before
@@ -450,7 +450,7 @@ async def test_a_guard_of_before_0_4_stays_in_force_as_a_monitor_that_is_named(t
     """Its first line was its only sign of a guard. `rosrv guard` names it, and does not change it."""
     async with monitors_of(tmp_path, {"sane.rv": FORMER}) as monitors:
         orders, why = orders_of(monitors), former_guard("sane", "sane.rv")
-        assert monitors.switches.enabled("sane")
+        assert monitors.switches.is_enabled("sane")
         listed, state = await orders.guards(guard_requests.GuardsWanted()), orders.state()
         assert (listed.guards, listed.warnings) == ([], [why])
         assert state is not None and (state.loaded, state.former) == (0, {"sane": why})
@@ -494,8 +494,8 @@ async def test_a_new_guard_is_in_shadow_mode_or_in_force(tmp_path: Path, shadow:
     async with monitors_of(tmp_path, enable="none") as monitors:
         await orders_of(monitors).new(request, "eve")
         switches = monitors.switches
-        assert (switches.enabled("speed"), switches.in_shadow("speed")) == (not shadow, shadow)
-        assert not switches.enabled("fence")
+        assert (switches.is_enabled("speed"), switches.in_shadow("speed")) == (not shadow, shadow)
+        assert not switches.is_enabled("fence")
         assert "\n    vMax = 0.3;\n" in monitors.sources.files["speed.rv"]
         assert monitors.confirm_by == pytest.approx(clock.wall() + 300.0)
         assert monitors.in_force.note[:14] == "preset speed 3"
@@ -528,13 +528,13 @@ async def test_a_guard_shows_its_version_and_a_changed_one_is_not_upgraded(
 
 
 async def test_an_old_guard_is_upgraded_as_it_was_planned(tmp_path: Path) -> None:
-    old, name = released("separation", 2).text, "separation"
+    old, name = released_preset("separation", 2).text, "separation"
     async with monitors_of(tmp_path, {"separation.rv": old}) as monitors:
         orders = orders_of(monitors)
         await monitors.shadow(admin.MonitorShadow([name], True), "eve")
         assert (await row(orders)).origin == "older"
         plan = await orders.plan(guard_requests.GuardTry(name=name, upgrade=True), "eve")
-        new = upgraded(old, values_of(monitors.givens.states(monitors.checked, name)), [], {}, "shadow")
+        new = upgrade_of(old, values_of(monitors.givens.states(monitors.checked, name)), [], {}, "shadow")
         assert (plan.file, plan.text, plan.changed) == ("separation.rv", new.text, new.changed)
         assert (plan.shadow, plan.warnings) == (True, new.warnings)
         await orders.upgrade(guard_requests.GuardUpgrade(name, confirm_within=60.0), "eve")

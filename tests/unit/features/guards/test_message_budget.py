@@ -12,7 +12,7 @@ from functools import partial
 import pytest
 
 from appliance.features.guards.presets import PRESETS, Guard, text_of
-from appliance.features.guards.released import released
+from appliance.features.guards.released import released_preset
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender, Outcome
 from rosmop.tests.acting import message
@@ -37,7 +37,7 @@ STILL, DRIVE = (message("geometry_msgs/Twist", linear__x=speed) for speed in (0.
 
 def texts() -> dict[str, str]:
     of_0_4_0 = {"separation": 2, "zone": 1}
-    found = {f"{name} {version}": released(name, version).text for name, version in of_0_4_0.items()}
+    found = {f"{name} {version}": released_preset(name, version).text for name, version in of_0_4_0.items()}
     return found | {name: text_of(Guard(name, PRESETS[name])) for name in of_0_4_0}
 
 
@@ -150,7 +150,7 @@ def test_motion_returns_within_a_second_after_each_act(
 
 
 def test_a_guard_goes_on_with_the_last_scan_until_that_is_too_old() -> None:
-    monitors, clock = begun(released("separation", 2).text)
+    monitors, clock = begun(released_preset("separation", 2).text)
     assert moves(drive(monitors, clock))
     for _ in range(4):  # 200 ms: the last scan is not yet too old
         outcome = tell(monitors, "/scan", HUGE, now := next(clock), SCANNER)
@@ -164,7 +164,7 @@ def test_a_guard_goes_on_with_the_last_scan_until_that_is_too_old() -> None:
 def test_a_monitor_over_its_budget_blinds_no_other() -> None:
     costly = """costly() { int n = 0; event scan(std::vector<float> r) /scan sensor_msgs/LaserScan '{ranges:r}' {
         for (int i = 0; i < r.size(); i++) { for (int j = 0; j < 300; j++) { n = (n * 31 + j) % 1000003; } } } }"""
-    texts_of_both = [released("separation", 2).text, costly]
+    texts_of_both = [released_preset("separation", 2).text, costly]
     for order in (texts_of_both, texts_of_both[::-1]):
         monitors, clock = begun(*order)
         outcomes = drive(monitors, clock)

@@ -10,7 +10,7 @@ import typer
 from appliance.features.guards import suggest_verb
 from appliance.features.guards.guard_answers import Suggestion, Suggestions
 from appliance.features.guards.presets import PRESETS
-from appliance.features.guards.suggest_verb import SCAN, WITHOUT, Scans, permitted
+from appliance.features.guards.suggest_verb import SCAN, WITHOUT, Scans, permitted_velocity
 from rosmop.tests.acting import message
 from rosmop.tool.last_messages import last_messages
 from tests.support.bags import make_bag
@@ -48,7 +48,7 @@ def formula(distance: float, person: float, age: float = 0.15) -> float:
 
 @pytest.mark.parametrize(("distance", "person"), [(1.0, 0.0), (2.0, 1.6)])
 def test_the_preset_itself_says_what_a_scan_permits(distance: float, person: float) -> None:
-    found = permitted("separation", {"person": str(person)}, recorded(scan(distance)))
+    found = permitted_velocity("separation", {"person": str(person)}, recorded(scan(distance)))
     assert found == pytest.approx(formula(distance, person), abs=0.03)
 
 
@@ -56,7 +56,7 @@ def test_a_scan_in_the_other_direction_permits_the_same() -> None:
     angles = [math.pi - 2 * math.pi / RAYS * place for place in range(RAYS)]
     ranges = [1 / math.cos(angle) if math.cos(angle) > 0.05 else 25.0 for angle in angles]
     turned, standing = (
-        permitted("separation", {"person": "0"}, recorded(message(
+        permitted_velocity("separation", {"person": "0"}, recorded(message(
             SCAN, angle_min=math.pi, angle_increment=step, range_min=0.05, range_max=30.0, ranges=ranges,
         )))
         for step in (-2 * math.pi / RAYS, 0.0)
@@ -66,7 +66,7 @@ def test_a_scan_in_the_other_direction_permits_the_same() -> None:
 
 def test_a_scan_without_rays_permits_no_motion() -> None:
     data = message(SCAN, angle_min=-3.0, angle_max=3.0, angle_increment=0.1, range_max=9.0, ranges=[])
-    assert permitted("separation", {}, recorded(data)) == 0
+    assert permitted_velocity("separation", {}, recorded(data)) == 0
 
 
 @pytest.mark.parametrize("preset", WITHOUT)

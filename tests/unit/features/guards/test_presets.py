@@ -14,7 +14,7 @@ from appliance.features.guards.presets import (
     Head,
     Preset,
     below_the_standard,
-    described,
+    description_of,
     head_of,
     preset_of,
     text_of,
@@ -150,11 +150,11 @@ def test_a_guard_is_its_preset_with_topics_types_and_values() -> None:
 }}
 {PRESETS["fence"].body}"""
     )
-    assert described(text) == (
+    assert description_of(text) == (
         f"preset fence {PRESETS['fence'].version}: command=/base/cmd geometry_msgs/TwistStamped,"
         " by=/pose geometry_msgs/PoseStamped"
     )
-    assert len(described(text.replace("/base/cmd", "/arm_controller" * 20))) == NOTE_LENGTH
+    assert len(description_of(text.replace("/base/cmd", "/arm_controller" * 20))) == NOTE_LENGTH
     made = preset_of(text)
     assert made is not None
     assert (made.name, made.text, made.version) == ("fence", text, PRESETS["fence"].version)

@@ -12,7 +12,7 @@ from unittest.mock import AsyncMock
 
 import pytest
 
-from appliance.base.withdrawal import WITHDRAWN, WithdrawnError, awaited
+from appliance.base.withdrawal import WITHDRAWN, WithdrawnError, withdrawable
 from appliance.channel.answers.graph_answers import Graph, Node, Topic
 from appliance.channel.messages import GuardTested, GuardTestWanted, MessageSeen, SubscriberReached
 from appliance.control.errors import SenselessError
@@ -255,7 +255,7 @@ async def test_only_a_robot_that_is_known_to_stand_is_tested(
         if refusal:
             gone = refusal == WITHDRAWN  # its client left while the robot was watched
             refused = pytest.raises((SenselessError, WithdrawnError), match=re.escape(refusal))
-            with awaited(lambda: gone), refused:
+            with withdrawable(lambda: gone), refused:
                 await proofs.test(GuardTest("fence"), "eve")
             assert not tested
             return

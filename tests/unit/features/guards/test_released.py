@@ -25,7 +25,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import FOLDER, origin_of
 from appliance.features.guards.robot_graph import TopicFacts
-from appliance.features.guards.upgrades import upgraded
+from appliance.features.guards.upgrades import upgrade_of
 from distribution import released_presets
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import sample
@@ -93,38 +93,38 @@ def test_a_value_beyond_its_range_or_without_a_place_is_a_change(preset: Preset)
     ("separation", 2), ("zone", 1), ("joints", 2), ("joints", 3), ("hold_to_run", 1), ("ready", 2),
 ])  # fmt: skip
 def test_a_guard_of_an_earlier_version_is_upgraded_with_its_values(name: str, version: int) -> None:
-    base = released.released(name, version)
+    base = released.released_preset(name, version)
     for guard in (made(base), replace(made(base), values={})):
         text = text_of(guard)
         assert origin_of(text) == "older"
-        new = upgraded(text, {}, [TopicFacts(topic, kind, (), ()) for topic, kind in old_types(text)])
+        new = upgrade_of(text, {}, [TopicFacts(topic, kind, (), ()) for topic, kind in old_types(text)])
         assert origin_of(new.text) == "current" and topics_in(new.text) == topics_in(text)
         assert values_in(new.text).items() >= values_in(text).items()
 
 
 @pytest.mark.parametrize(("old", "new", "version"), [("enable", "hold_to_run", 1), ("arm", "ready", 2)])
 def test_a_preset_with_its_old_name_is_the_same_preset(old: str, new: str, version: int) -> None:
-    text = text_of(made(released.released(new, version)))
+    text = text_of(made(released.released_preset(new, version)))
     preset = preset_of(text)
     assert text.startswith(f"preset {old} {version} as mine")
     assert preset is not None and preset.name == new and preset_named(old) is PRESETS[new]
     changed = with_values(text, {"silent": "0.45"})
     assert changed.startswith(f"preset {old} {version} as mine") and origin_of(changed) == "older"
-    assert upgraded(changed, {}, ()).text.startswith(f"preset {new} {PRESETS[new].version} as mine")
+    assert upgrade_of(changed, {}, ()).text.startswith(f"preset {new} {PRESETS[new].version} as mine")
 
 
 def test_an_upgrade_takes_a_further_topic_that_no_node_has_yet(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = re.sub(r"\n    topic state [^\n]*", "", released.released("joints", 2).text)
+    text = re.sub(r"\n    topic state [^\n]*", "", released.released_preset("joints", 2).text)
     base = replace(PRESETS["joints"], source=text)
     for module in (released, upgrades):
-        monkeypatch.setattr(module, "released", lambda _name, _version: base)
+        monkeypatch.setattr(module, "released_preset", lambda _name, _version: base)
     with pytest.raises(GuardError, match="joints needs a topic for state: give --topic state=TOPIC"):
-        upgraded(base.text, {}, [])
-    new = upgraded(base.text, {}, [], {"state": "/arm/joint_states"})
+        upgrade_of(base.text, {}, [])
+    new = upgrade_of(base.text, {}, [], {"state": "/arm/joint_states"})
     assert topics_in(new.text)["state"] == "/arm/joint_states"
     other = TopicFacts("/arm/joint_states", "nav_msgs/Odometry", (), ())
     with pytest.raises(GuardError, match="has the type nav_msgs/Odometry on this robot"):
-        upgraded(base.text, {}, [other], {"state": "/arm/joint_states"})
+        upgrade_of(base.text, {}, [other], {"state": "/arm/joint_states"})
 
 
 def old_types(text: str) -> Iterator[tuple[str, str]]:
@@ -137,7 +137,7 @@ def old_types(text: str) -> Iterator[tuple[str, str]]:
 def test_a_preset_that_differs_from_its_released_text_has_a_higher_version(preset: Preset) -> None:
     versions = [int(version) for name, version in RELEASED if name == preset.name]
     if preset.version in versions:
-        assert preset.text == released.released(preset.name, preset.version).text
+        assert preset.text == released.released_preset(preset.name, preset.version).text
     else:
         assert preset.version > max(versions, default=0)
 
@@ -152,8 +152,8 @@ def older(monkeypatch: pytest.MonkeyPatch) -> Iterator[Preset]:
     assert text.count("0..2;") == 1
     new = replace(now, source=text)
     monkeypatch.setitem(PRESETS, "speed", new)
-    monkeypatch.setattr(released, "released", lambda _name, _version: now)
-    monkeypatch.setattr(upgrades, "released", lambda _name, _version: now)
+    monkeypatch.setattr(released, "released_preset", lambda _name, _version: now)
+    monkeypatch.setattr(upgrades, "released_preset", lambda _name, _version: now)
     origin_of.cache_clear()
     yield now
     origin_of.cache_clear()
@@ -164,7 +164,7 @@ def test_an_upgrade_keeps_name_topics_types_values_and_order(older: Preset, kind
     guard = Guard("cap", older, {"command": "/base/cmd"}, {"command": kind}, {"vMax": "1.5", "aMax": "2"})
     text = text_of(guard) + "\norder fence < cap;\n"
     assert origin_of(text) == "older"
-    new = upgraded(text, {"vMax": "1.25"}, [])
+    new = upgrade_of(text, {"vMax": "1.25"}, [])
     assert origin_of(new.text) == "current" and new.text.endswith("\norder fence < cap;\n")
     assert (topics_in(new.text), types_in(new.text)) == ({"command": "/base/cmd"}, {"command": kind})
     assert (values_in(new.text)["vMax"], values_in(new.text)["aMax"]) == ("1.25", "2")
@@ -179,13 +179,13 @@ def test_a_value_that_cannot_be_kept_is_named(older: Preset) -> None:
         ({"wMax": "3"}, "wMax=3 cannot be kept: speed 1000 has no such value"),
     ):
         with pytest.raises(GuardError, match=re.escape(why)):
-            upgraded(text_of(Guard("cap", older, types=types, values=values)), {}, [])
+            upgrade_of(text_of(Guard("cap", older, types=types, values=values)), {}, [])
     for text, why in (
         (text_of(Guard("cap", older, types=types)).replace("clamp", "fmin", 1), "was changed"),
         (text_of(Guard("cap", PRESETS["speed"], types=types)), "has the present version"),
     ):
         with pytest.raises(GuardError, match=why):
-            upgraded(text, {}, [])
+            upgrade_of(text, {}, [])
 
 
 def test_a_release_is_refused_until_its_presets_are_kept(

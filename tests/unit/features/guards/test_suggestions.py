@@ -13,7 +13,7 @@ from appliance.features.guards.presets import PRESETS, GuardError, text_of, topi
 from appliance.features.guards.robot_graph import MAX_COMMANDS, RobotGraph, TopicFacts
 from appliance.features.guards.stimuli import stimulus
 from appliance.features.guards.suggestions import NOT_SUGGESTED, advice
-from appliance.features.guards.upgrades import planned
+from appliance.features.guards.upgrades import plan
 from rosmop.check.sources import compiled_from
 from tests.support.examples import sample
 from tests.support.features.guards.running_guard import DEFINITIONS
@@ -36,7 +36,7 @@ def graph_of(robot: str) -> list[TopicFacts]:
 
 def text(proposal: Suggestion, graph: list[TopicFacts]) -> str:
     values = {**proposal.measured, **proposal.values}
-    return text_of(planned(PRESETS[proposal.preset], proposal.name, proposal.topics, graph, values, {}))
+    return text_of(plan(PRESETS[proposal.preset], proposal.name, proposal.topics, graph, values, {}))
 
 
 def printed(found: Suggestions) -> Iterator[str]:
@@ -276,7 +276,7 @@ def named_values(one: Suggestion, sentences: Sequence[str]) -> dict[str, str]:
 def moves(one: Suggestion, graph: list[TopicFacts], named: dict[str, str]) -> bool:
     """Whether a motion passes when each publisher has sent what an honest robot sends, at its rate, for 3 s."""
     preset = PRESETS[one.preset]
-    guard = planned(preset, one.name, one.topics, graph, {**one.measured, **one.values, **named}, {})
+    guard = plan(preset, one.name, one.topics, graph, {**one.measured, **one.values, **named}, {})
     sent: dict[str, list[bytes]] = {}
     text = text_of(guard)
     kinds = dict.fromkeys(("stop", "reset", "fix", "check"), "std_msgs/Bool") | types_in(text)
@@ -447,15 +447,13 @@ def test_a_topic_of_any_type_is_watched_by_its_silence_alone() -> None:
     types = {"by": "sensor_msgs/Joy"}
     for kind, silent in (("sensor_msgs/Joy", True), ("std_msgs/String", True), ("sensor_msgs/Imu", False)):
         graph = [*graph_of("turtlebot3"), TopicFacts("/link", kind, ("/joy",), ())]
-        guard = planned(
+        guard = plan(
             PRESETS["sensor"], "link", {"command": "/cmd_vel", "by": "/link"}, graph, {"silent": "0.3"}, {}
         )
         assert (guard.values.get("frozen") == "0") == silent
         compiled_from({"link.rv": text_of(guard)}, DEFINITIONS)
     with pytest.raises(GuardError, match="only the silence is judged"):
-        planned(
-            PRESETS["sensor"], "link", {"command": "/cmd_vel", "by": "/joy"}, graph, {"frozen": "5"}, types
-        )
+        plan(PRESETS["sensor"], "link", {"command": "/cmd_vel", "by": "/joy"}, graph, {"frozen": "5"}, types)
 
 
 PLANS = [
@@ -476,17 +474,17 @@ def test_a_guard_that_the_graph_contradicts_is_refused(
     preset: str, topics: dict[str, str], kinds: dict[str, str], why: str
 ) -> None:
     with pytest.raises(GuardError) as error:
-        text_of(planned(PRESETS[preset], "guard", topics, graph_of("turtlebot3"), {}, kinds))
+        text_of(plan(PRESETS[preset], "guard", topics, graph_of("turtlebot3"), {}, kinds))
     assert why in str(error.value)
 
 
 def test_a_topic_that_comes_later_has_the_type_that_is_given() -> None:
-    later = planned(
+    later = plan(
         PRESETS["speed"], "later", {"command": "/new"}, [], {}, {"command": "ackermann_msgs/AckermannDrive"}
     )
     assert "command = /new ackermann_msgs/AckermannDrive;" in text_of(later)
     goal = "/arm_controller/follow_joint_trajectory/goal"
-    answer = planned(PRESETS["answer"], "answer", {"command": goal}, graph_of("fetch"), {}, {})
+    answer = plan(PRESETS["answer"], "answer", {"command": goal}, graph_of("fetch"), {}, {})
     assert answer.topics["cancel"] == goal.replace("/goal", "/cancel")
 
 

@@ -114,7 +114,7 @@ def test_a_moving_base_is_stopped_by_an_unreadable_observation(
     assert monitors.judge("/cmd_vel", bytearray(DRIVE), now).result == "passed"
     outcome = monitors.judge(topics[damaged], bytearray(DAMAGE[damage](GOOD[name][damaged])), now + 1)
     assert [fault.malformed for fault in outcome.faults] == [True]
-    sent = [one.data for each in monitors.advance(now + 2) for one in each.sent()]
+    sent = [one.data for each in monitors.advance(now + 2) for one in each.sent_messages()]
     assert sent == [bytes(48)]
     driven = monitors.judge("/cmd_vel", bytearray(DRIVE), now + 3)
     assert driven.result == ("dropped" if name == "estop" or damaged in SPEAKERS.get(name, ()) else "changed")
@@ -286,7 +286,7 @@ def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
     assert monitors.judge("/move_base/goal", goal, SECOND).result == "passed"
     outcome = monitors.judge("/move_base/result", bytearray(b"\1"), 2 * SECOND)
     assert [fault.malformed for fault in outcome.faults] == [True]
-    sent = [one.topic for each in monitors.advance(200 * SECOND) for one in each.sent()]
+    sent = [one.topic for each in monitors.advance(200 * SECOND) for one in each.sent_messages()]
     assert sent == ["/move_base/cancel"]
 
 
@@ -295,7 +295,7 @@ def test_an_unreadable_joint_state_ends_the_trajectory(made: Made) -> None:
     monitors = started("joints", made)
     outcome = monitors.judge("/joint_states", bytearray(b"\1"), SECOND)
     assert [fault.malformed for fault in outcome.faults] == [True]
-    sent = [one.topic for each in monitors.advance(SECOND + 1) for one in each.sent()]
+    sent = [one.topic for each in monitors.advance(SECOND + 1) for one in each.sent_messages()]
     assert sent == [PRESETS["joints"].given_topics["command"]]
 
 

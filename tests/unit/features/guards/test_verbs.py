@@ -51,7 +51,7 @@ from appliance.features.guards.requests import (
     GuardTry,
     GuardUpgrade,
 )
-from appliance.features.guards.upgrades import planned, same
+from appliance.features.guards.upgrades import plan, same
 from rosmop.types.roles import ANY_TYPE
 from tests.support.answers import example
 from tests.support.memory_call import call_of
@@ -440,7 +440,7 @@ def test_the_undo_of_a_removal_makes_the_same_guard(
         further=[value for option, value in options if option == "--topic"],
         kinds=[value for option, value in options if option == "--type"],
     )  # fmt: skip
-    again = text_of(planned(PRESETS[order.preset], order.name, order.topics, [], order.values, order.types))
+    again = text_of(plan(PRESETS[order.preset], order.name, order.topics, [], order.values, order.types))
     assert order.shadow and (topics_in(again), types_in(again)) == (guard.topics, guard.types)
     found = values_in(again)
     assert found.keys() == guard.values.keys()

@@ -30,7 +30,7 @@ from appliance.formats.machine_report import (
     Period,
     Reading,
     ReportedLog,
-    merged,
+    merge,
     read_records,
 )
 from appliance.formats.report_words import page, report_lines
@@ -50,7 +50,7 @@ def entry(hour: float, event: str, resource: str = "", reason: str = "", **detai
 
 
 def read(*entries: LogEntry, period: Period = ALWAYS) -> Reading:
-    return read_records(merged({"": entries}), period)
+    return read_records(merge({"": entries}), period)
 
 
 def rows_of(*entries: LogEntry) -> list[Intervention]:
@@ -254,7 +254,7 @@ def test_two_logs_are_one_history_by_time_and_a_moved_record_counts_once() -> No
         entry(6, "took over", appliance="b", other="a"),
         entry(7, "monitor enabled", "speed", who="bob", earlier="disabled"),
     ]
-    found = read_records(merged({"a": a, "b": b}), ALWAYS)
+    found = read_records(merge({"a": a, "b": b}), ALWAYS)
     assert [(row.appliance, row.event) for row in found.interventions] == [
         ("a", "policy file refused"), ("a", "monitor disabled"), ("a", "authority handed over"),
         ("b", "took over"), ("b", "monitor enabled"),
@@ -272,7 +272,7 @@ def test_a_clock_that_was_set_back_does_not_change_the_order_of_a_log() -> None:
     )
     backwards = [LogEntry(1, late.record), LogEntry(2, early.record)]
     found = read_records(
-        merged({"a": backwards, "b": [entry(3, "host renewed", name="t", replaced="1")]}), ALWAYS
+        merge({"a": backwards, "b": [entry(3, "host renewed", name="t", replaced="1")]}), ALWAYS
     )
     events = [row.event for row in found.interventions]
     assert events == ["host renewed", "monitor disabled", "monitor enabled"]
@@ -470,7 +470,7 @@ def test_a_name_of_now_is_marked_and_a_name_of_then_is_not() -> None:
 
 def test_two_machines_have_a_column() -> None:
     found = read_records(
-        merged({"a": [_HANDED[0]], "b": [entry(5, "took over", appliance="b", other="a")]}), ALWAYS
+        merge({"a": [_HANDED[0]], "b": [entry(5, "took over", appliance="b", other="a")]}), ALWAYS
     )
     logs = [
         ReportedLog(name=name, id=name, begins_utc=rfc3339(HOUR), last=1, verification=None) for name in "ab"

@@ -14,7 +14,7 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Token, Tokens
 from appliance.features.logbook import report_verb
-from appliance.formats.machine_report import MachineReport, Period, Reading, ReportedLog, merged, read_records
+from appliance.formats.machine_report import MachineReport, Period, Reading, ReportedLog, merge, read_records
 from appliance.formats.report_words import page
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy_compiler import compile_policy
@@ -148,7 +148,7 @@ IN_FORCE = PolicyInForce(
 def report() -> MachineReport:
     policy = compile_policy(POLICY, file="robot.ini", robot=[ipaddress.ip_address("10.0.0.2")])
     period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
-    read = read_records(merged({"": entries()}), period)
+    read = read_records(merge({"": entries()}), period)
     result = VerificationResult(
         time_utc="2026-05-03T04:00:00.000000000Z", complete=True, verdict="The log is complete and unchanged",
         records=14, text="", log="ab", through=14,
@@ -230,7 +230,7 @@ def test_an_interface_that_is_off_is_not_named(name: str) -> None:
 def test_a_door_is_named_with_its_port_that_needs_no_ticket(port: int | None, free: bool) -> None:
     detail = {"address": "10.78.0.1", "port": port, "source": None}
     record = AuditRecord(id="1", time=1, event="door added", resource="agent", detail=detail)
-    read = read_records(merged({"": [LogEntry(1, record)]}), Period(0, 9))
+    read = read_records(merge({"": [LogEntry(1, record)]}), Period(0, 9))
     (door,) = (
         one for one in report_verb.interfaces(STATUS, IN_FORCE, TOKENS, read) if one.name == "door agent"
     )

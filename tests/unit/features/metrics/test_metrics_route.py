@@ -8,7 +8,7 @@ from appliance.base import clock
 from appliance.base.metric import BOUNDS
 from appliance.channel.answers.measures import Measures
 from appliance.features.metrics.metric_table import METRICS
-from appliance.features.metrics.routes import rendered
+from appliance.features.metrics.routes import render
 from appliance.telemetry.audit_trail import Meter
 from tests.support.answers import example
 
@@ -20,7 +20,7 @@ def body(processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "r
     for seconds in (0.0003, 99.0):
         meter.decisions["publish", "deny"] += 1
         meter.decision_seconds.observe(seconds)
-    meter.called("getPid", 0.002)
+    meter.count_call("getPid", 0.002)
     return example(
         Measures,
         decisions=[(*labels, count) for labels, count in meter.decisions.items()],
@@ -58,7 +58,7 @@ def host(name: str, state: str, **more: Any) -> dict[str, Any]:
 
 
 def test_every_metric_is_exported_as_listed() -> None:
-    families = {one.name: one for one in text_string_to_metric_families(rendered(body(), CALLS).decode())}
+    families = {one.name: one for one in text_string_to_metric_families(render(body(), CALLS).decode())}
     for metric in METRICS:
         family = families[metric.name.removesuffix("_total")]
         assert family.type == metric.kind
@@ -71,7 +71,7 @@ def exported() -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
     """Return the values by name and labels."""
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
-        for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
+        for family in text_string_to_metric_families(render(body(), CALLS).decode())
         for sample in family.samples
     }
 
@@ -119,6 +119,6 @@ def test_tunnels_are_measured() -> None:
 
 def test_processes_of_one_role_have_separate_series() -> None:
     answer = body([{"role": "relay", "pid": os.getpid(), "restarts": restarts} for restarts in (1, 2)])
-    lines = [one for one in rendered(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
+    lines = [one for one in render(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
     assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
     assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines

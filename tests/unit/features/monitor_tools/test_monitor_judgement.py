@@ -10,11 +10,9 @@ TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_sr
 
 def test_a_monitor_is_described() -> None:
     compiler = Compiler()
-    a = compiler.described(
-        example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a"
-    )
+    a = compiler.describe(example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a")
     again = example(Monitors, revision=1)  # already compiled: the same revision is not compiled again
-    b = compiler.described(again, "b")
+    b = compiler.describe(again, "b")
     (said,) = a.events
     assert (said.name, said.topic, said.type, said.part, said.every) == (
         "said", "/chatter", "std_msgs/String", None, None,
@@ -27,4 +25,4 @@ def test_a_monitor_is_described() -> None:
     assert str(compiler.picture(again, "a")).startswith("<svg ")
     assert compiler.picture(again, "b") is None
     with pytest.raises(KeyError):
-        compiler.described(again, "nobody")
+        compiler.describe(again, "nobody")

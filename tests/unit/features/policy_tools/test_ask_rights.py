@@ -94,7 +94,7 @@ def test_an_allowed_right_is_that_hosts_alone() -> None:
     answered(policy, MOVE, LIGHT, TOOL, cmd_vel="allow", rostopic="allow")
     assert may(policy, MOVE) and may(policy, TOOL) and not may(policy, LIGHT)
     assert not may(policy, RightKind(Category.PUBLISH, "/base/cmd_vel", ip_address("10.0.0.6")))
-    policy.judged()
+    policy.judge()
 
 
 @pytest.mark.parametrize("names", ONE_RUN.values(), ids=ONE_RUN)
@@ -117,13 +117,13 @@ def test_a_wider_answer_covers_the_next_question() -> None:
 def test_a_denied_right_is_a_test_case_and_is_not_asked_again() -> None:
     policy = asked()
     assert answered(policy, MOVE, cmd_vel="deny") == ["/base/cmd_vel"]
-    policy.judged()
+    policy.judge()
     again = asked(policy.text, policy.cases)
     assert answered(again, MOVE) == []
     again.text = again.text.replace("[Nodes]\n", "[Nodes]\n/pad = 10.0.0.5\n")
     again.text = again.text.replace("[Publishers]\n", "[Publishers]\n/base/cmd_vel = robot 10.0.0.5\n")
     with pytest.raises(PolicyError, match="expected deny"):
-        again.judged()
+        again.judge()
 
 
 @pytest.mark.parametrize("node", ["", "/pad", "/rosparam-4711", "not a name", "/a:b #c"])
@@ -133,10 +133,10 @@ def test_each_denied_right_is_a_case_that_the_next_run_reads(category: Category,
     kind = RightKind(category, names.get(category, "/x_*"), PAD)
     policy = asked()
     policy.deny(kind, node)
-    policy.judged()
+    policy.judge()
     again = asked(policy.text, yaml.load(policy.cases_text, yaml.BaseLoader)["cases"])  # noqa: S506  only texts
     assert list(again.missing(Counter({(kind, node): 1}))) == []
-    again.judged()
+    again.judge()
 
 
 def test_a_right_for_later_is_asked_again_and_quit_asks_no_more() -> None:

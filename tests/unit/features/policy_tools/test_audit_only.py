@@ -1,6 +1,6 @@
 import pytest
 
-from appliance.features.policy_tools.audit_only import EnforceError, enforced
+from appliance.features.policy_tools.audit_only import EnforceError, enforced_text
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.sections import DECIDERS
 
@@ -19,7 +19,7 @@ def lenient(text: str) -> set[str]:
 @pytest.mark.parametrize("head", [HEAD, HEAD.lower(), HEAD.upper()], ids=["plain", "lower", "upper"])
 def test_each_section_is_enforced_alone_and_the_others_stay(head: str, line: str, section: str) -> None:
     head = head.replace("TELL = RULE", "tell = rule")
-    change = enforced(f"{head}{line}{TAIL}", [section.lower()])
+    change = enforced_text(f"{head}{line}{TAIL}", [section.lower()])
     assert change.sections == (section,)
     assert lenient(change.text) == {*SECTIONS} - {section}
     assert change.text.startswith(head) and change.text.endswith(TAIL)
@@ -27,7 +27,7 @@ def test_each_section_is_enforced_alone_and_the_others_stay(head: str, line: str
 
 
 def test_all_sections_are_enforced_without_the_line() -> None:
-    change = enforced(f"{HEAD}audit-only = [Nodes] publishers{TAIL}")
+    change = enforced_text(f"{HEAD}audit-only = [Nodes] publishers{TAIL}")
     assert change.sections == ("Nodes", "Publishers")
     assert change.text == f"{HEAD.rstrip()}{TAIL}"
 
@@ -49,5 +49,5 @@ def test_a_section_that_cannot_be_enforced_is_an_error(
     options: str, sections: list[str], reason: str
 ) -> None:
     with pytest.raises(EnforceError) as caught:
-        enforced(f"{options}[Nodes]\n/a = 10.0.0.1\n", sections)
+        enforced_text(f"{options}[Nodes]\n/a = 10.0.0.1\n", sections)
     assert reason in str(caught.value)

@@ -9,7 +9,7 @@ from appliance.audit.log.events import EVENTS
 from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.channel.answers.policy_answers import PolicyKnown, Why
 from appliance.channel.messages.relay_link import Violation
-from appliance.features.policy_tools.explanations import DENIALS, asks_policy, explained, granted, is_denial
+from appliance.features.policy_tools.explanations import DENIALS, asks_policy, explained, grant_of, is_denial
 from appliance.features.policy_tools.grant import UngrantableError
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry
@@ -167,7 +167,7 @@ def test_a_block_is_lifted_and_no_policy_is_changed(event: str, *, lifted: bool)
     assert (found.grant, allowing(found)) == (None, [])
     assert found.refusal.endswith(": rosrv host unblock 10.0.0.9")
     with pytest.raises(UngrantableError, match=f"rosrv host unblock {HOST}$"):
-        granted(record, current)
+        grant_of(record, current)
 
 
 def test_a_name_like_a_block_is_not_a_block() -> None:

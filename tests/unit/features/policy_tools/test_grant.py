@@ -113,13 +113,13 @@ def test_an_address_of_the_machine_is_granted_as_the_robot_unless_the_policy_nam
     text = "[Nodes]\ndefault = robot\n[Subscribers]\n/a = robot\n"
     found = grant(text, "p.ini", own, wanted)
     assert found.added == ("/z = robot",)
-    assert own.compiled(found.text, "p.ini").decide(request(Category.SUBSCRIBE, "/a")).allowed
+    assert own.compile(found.text, "p.ini").decide(request(Category.SUBSCRIBE, "/a")).allowed
     named = grant(text + "/b = 10.0.0.9\n", "p.ini", own, wanted)
     assert "/z = 10.0.0.9" in named.added
 
 
 def test_no_tool_compiles_a_policy_with_a_part_of_what_is_known_beside_it() -> None:
-    """`PolicyContext.compiled` takes all: hosts, the robot, and the other addresses of its machine."""
+    """`PolicyContext.compile` takes all: hosts, the robot, and the other addresses of its machine."""
     tools = Path(policy_tools.__file__).parent
     assert [file.name for file in tools.glob("*.py") if "hosts=known.hosts" in file.read_text("utf-8")] == []
 
@@ -293,7 +293,7 @@ def test_a_right_with_a_time_is_written_and_the_times_of_others_are_kept(
     text = f"[Nodes]\ndefault = *\n[Publishers]\n{before}\n[Subscribers]\n"
     found = grant(text, "p.ini", NOW, asked(str(HOST), "/it", "publish", "/x", {}), until)
     assert after in found.text.splitlines()
-    assert decide_right(NOW.compiled(found.text, "p.ini"), Right(request(Category.PUBLISH, "/x"))).allowed
+    assert decide_right(NOW.compile(found.text, "p.ini"), Right(request(Category.PUBLISH, "/x"))).allowed
 
 
 @pytest.mark.parametrize(

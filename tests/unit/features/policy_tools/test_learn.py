@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn, needed_rights
+from appliance.features.policy_tools.learn import LearnedPolicy, Observation, is_covered, learn, needed_rights
 from appliance.master.calls.call import RosCall
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
@@ -82,7 +82,7 @@ def test_a_search_for_a_parameter_may_find_it_the_next_time() -> None:
     ],
 )
 def test_only_the_appliances_own_robot_is_its_group(given: str, robot: list[str], expected: bool) -> None:
-    assert covered(ipaddress.ip_network(given), map(ipaddress.ip_network, robot)) == expected
+    assert is_covered(ipaddress.ip_network(given), map(ipaddress.ip_network, robot)) == expected
 
 
 def test_anonymous_names_become_patterns() -> None:

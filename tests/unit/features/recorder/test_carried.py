@@ -19,7 +19,7 @@ from appliance.relay.connections.ranked_publication import RankedPublication
 from appliance.relay.ranked_topic import RankedTopic
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.rate_limit import SharedRateLimit
-from rosmop.recordings.recording import messages_of, open_recording, received
+from rosmop.recordings.recording import inputs, messages_of, open_recording
 from roswire.standard import standard_definitions
 from tests.unit.relay.connections.test_ranked_publication import PLACE, TWIST
 from tests.unit.relay.connections.test_relayed_topic import Story, batch
@@ -146,7 +146,7 @@ def test_a_replay_has_the_messages_that_monitors_got(way: str, tmp_path: Path) -
     assert 0 < len(got) < sum(counters) == sum(row.messages for row in recording.topics)
     for path in (bag, tmp_path / "a.mcap"):
         with closing(open_recording(path)) as reader:
-            wanted = {row.id for row in received(reader, ["*"])}
+            wanted = {row.id for row in inputs(reader, ["*"])}
             replayed = [(time, data) for row, time, data in messages_of(reader) if row.id in wanted]
         assert sorted(replayed) == got
     judged = {struct.unpack_from("<d", data)[0] for _time, data in got}

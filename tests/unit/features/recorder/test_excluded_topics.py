@@ -17,7 +17,7 @@ FILES = {
 
 
 def test_the_sums_of_excluded_types_are_those_of_their_definitions() -> None:
-    definitions = standard_definitions().extended(Definitions.from_files(FILES))
+    definitions = standard_definitions().merge(Definitions.from_files(FILES))
     never = RecorderRules().never
     assert known_sums(never) == {name: definitions.md5sum(name) for name in never}
     assert known_sums(["sensor_msgs/Imag?", "/camera/*"]) == {IMAGE: definitions.md5sum(IMAGE)}

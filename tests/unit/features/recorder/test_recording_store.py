@@ -74,9 +74,9 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
     assert not (tmp_path / first.id).exists()
     assert again.find(first.id) is None
     again = RecordingStore(tmp_path, disk=64 * MIB, reserve=0, seconds=None, clock=wall_ns)
-    assert list(again.removed()) == [(first, "eve", "")]
+    assert list(again.removals()) == [(first, "eve", "")]
     again.note(first.id)
-    assert not list(again.removed())
+    assert not list(again.removals())
     assert {path.name for path in tmp_path.iterdir()} == {second.id, f".{'f' * 20}.part", "d" * 20, "e" * 20}
 
 
@@ -229,7 +229,7 @@ def test_a_recording_that_a_person_removed_stops_no_removal(
         for one in kept:
             store.remove(one, "eve", "")
     assert store.recordings == []
-    assert [one for one, _who, _why in make().removed()] == kept
+    assert [one for one, _who, _why in make().removals()] == kept
 
 
 def displaced(store: RecordingStore) -> list[tuple[Recording, str]]:
@@ -255,7 +255,7 @@ def test_a_recording_of_an_earlier_version_ages_from_the_first_start(tmp_path: P
 class KeptRecording:
     def __init__(self, folder: Path, age: AgeClock) -> None:
         self._store = RecordingStore(
-            folder, disk=64 * MIB, reserve=0, seconds=KEPT / SECOND, clock=age, dated=age.dated
+            folder, disk=64 * MIB, reserve=0, seconds=KEPT / SECOND, clock=age, dated=age.true_date
         )
 
     def make(self) -> None:

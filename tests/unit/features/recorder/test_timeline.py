@@ -94,7 +94,7 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
         (2_100_000_000, "/talker", "1.1"),
     ]
     assert found.chosen == 2
-    last = MessagePosition.parsed(found.messages[-1].place)
+    last = MessagePosition.parse(found.messages[-1].place)
     assert last is not None
     following = messages_around(RECORDING, bag, last, neighbours=2)
     assert following.messages[following.chosen] == found.messages[-1]
@@ -157,7 +157,7 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
     while True:
         found = messages_around(RECORDING, tmp_path / "a.bag", at, neighbours=1)
         seen += [message.fields["data"] for message in found.messages[found.chosen + (at != 0) :]]
-        after = MessagePosition.parsed(found.messages[-1].place)
+        after = MessagePosition.parse(found.messages[-1].place)
         assert after is not None
         if after == at:
             break
@@ -167,9 +167,9 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["2026-02-30", "10000-01-01", "2026-03-01", "", "1795155949800000000-4109"])
 def test_an_impossible_date_is_refused(text: str) -> None:
-    assert MessagePosition.parsed(text) is None
+    assert MessagePosition.parse(text) is None
     place = MessagePosition(1795155949800000000, 4109, 2210)
-    assert MessagePosition.parsed(str(place)) == place
+    assert MessagePosition.parse(str(place)) == place
 
 
 def test_publishers_cannot_forge_events(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ async def test_without_a_proxy_only_the_issuers_host_is_asked(url: str) -> None:
 def test_a_start_records_who_gets_which_role_and_no_secret(tmp_path: Path) -> None:
     file = tmp_path / "secret"
     file.write_text("the client's secret")
-    recorded = sso(client_secret_file=file, roles={"admin": ["it"]}).recorded()
+    recorded = sso(client_secret_file=file, roles={"admin": ["it"]}).audit_values()
     assert recorded["roles"] == "{'admin': ['it']}" and recorded["client_secret_file"] == str(file)
     assert "the client's secret" not in str(recorded)
-    assert Sso().recorded() == {}
+    assert Sso().audit_values() == {}

@@ -24,7 +24,7 @@ class CountedDatabase(Database):
         self._number += 1
         return self._number
 
-    async def settled(self) -> None: ...
+    async def until_settled(self) -> None: ...
 
 
 class Member:

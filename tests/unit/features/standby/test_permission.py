@@ -142,7 +142,7 @@ class Pair:
                 self.step(name if name == "all to control" else "")
 
     async def _answer(self, number: int) -> None:
-        await self.control.stored()
+        await self.control.until_stored()
         self.answered = max(self.answered, number)
 
     async def turn(self) -> None:

@@ -86,7 +86,7 @@ async def standby_side(directory: Path, active: ActiveSide) -> AsyncIterator[Sta
 
 async def require_equal(directory: Path, active: ActiveSide) -> None:
     """Check the tables. The standby may have rows before the active appliance has them on its disk."""
-    await active.database.settled()
+    await active.database.until_settled()
     assert tables_of(directory / "standby.db") == tables_of(directory / "active.db")
 
 
@@ -122,8 +122,8 @@ async def test_a_pair_is_upgraded_from_the_state_of_the_last_release(tmp_path: P
         pair = replicated(tmp_path, schema=STATE_SCHEMA, epoch=turn)
         async with asyncio.timeout(SECONDS), pair as (active, standby):
             active.database.put("setting", f"turn {turn}", "done")
-            await active.sender.acknowledged(active.database.number)
-            await active.database.settled()
+            await active.sender.until_acknowledged(active.database.number)
+            await active.database.until_settled()
             assert not standby.ends
         dumps = []
         for name in ("active.db", "standby.db"):
@@ -141,7 +141,7 @@ async def test_changes_arrive_and_are_acknowledged(tmp_path: Path) -> None:
         for _ in range(30):
             for _ in range(20):
                 change_randomly(active.database, chosen)
-            await active.sender.acknowledged(active.database.number)
+            await active.sender.until_acknowledged(active.database.number)
             assert standby.replica.position.number == active.database.number
             assert active.sender.lag()[:4] == (True, 0, 0, None)
             assert active.sender.lag().caught_up
@@ -167,7 +167,7 @@ async def test_nothing_is_lost_however_often_the_link_is_cut(tmp_path: Path, see
             step += 1
             active.database.put("mark", step)
             if step % 3 == 0:
-                await active.sender.acknowledged(active.database.number)
+                await active.sender.until_acknowledged(active.database.number)
                 assert (step,) in tables_of(tmp_path / "standby.db")["mark"]
             if step % 20 == 13:
                 await standby.close()
@@ -176,7 +176,7 @@ async def test_nothing_is_lost_however_often_the_link_is_cut(tmp_path: Path, see
                 await active.close()
                 active = ActiveSide(tmp_path / "active.db", server, room=20_000)
         proxy.cutting = False
-        await active.sender.acknowledged(active.database.number)
+        await active.sender.until_acknowledged(active.database.number)
         await require_equal(tmp_path, active)
     await standby.close()
     await active.close()
@@ -196,7 +196,7 @@ async def test_a_standby_that_was_away_for_long_gets_a_snapshot(tmp_path: Path) 
             while standby.replica.position.number < 3000:
                 change_randomly(active.database, chosen)
                 await asyncio.sleep(0)
-            await active.sender.acknowledged(active.database.number)
+            await active.sender.until_acknowledged(active.database.number)
             await require_equal(tmp_path, active)
 
 
@@ -204,7 +204,7 @@ async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: P
     async with active_side(tmp_path) as active:
         async with standby_side(tmp_path, active) as standby:
             active.database.put("thing", "a", 1, None)
-            await active.sender.acknowledged(1)
+            await active.sender.until_acknowledged(1)
         for number in range(500):
             active.database.put("thing", f"row {number}", number, "x" * 1000)
         async with connected(tmp_path, active) as link:
@@ -248,7 +248,7 @@ async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: P
     async with active_side(tmp_path) as active:
         active.database.put("thing", "a", 1, None)
         history = active.database.history
-        waiting = asyncio.create_task(active.sender.acknowledged(1))
+        waiting = asyncio.create_task(active.sender.until_acknowledged(1))
         for lie in (Stored(1, history, 2), Stored(1, history, 1 << 61)):
             async with connected(tmp_path, active) as link:
                 await link.send(Stored(0, "", 0))
@@ -284,7 +284,7 @@ async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_long
                 assert isinstance(message, Changes)
                 number = message.first + len(message.changes) - 1
                 await link.send(Stored(1, history, number))
-            await active.sender.acknowledged(3)
+            await active.sender.until_acknowledged(3)
         async with connected(tmp_path, active) as link:
             await link.send(Stored(1, history, 1))
             await take_snapshot(link)
@@ -294,7 +294,7 @@ async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_long
 async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
     async with asyncio.timeout(SECONDS), replicated(tmp_path, epoch=5) as (active, standby):
         active.database.put("thing", "a", 1, None)
-        await active.sender.acknowledged(1)
+        await active.sender.until_acknowledged(1)
         active.epoch = 4
         active.database.put("thing", "b", 1, None)
         await until(lambda: "epoch 4 has ended: epoch 5 has begun" in standby.ends)
@@ -303,7 +303,7 @@ async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
         await until(lambda: f"the active appliance refuses: {reason}" in standby.ends)
         assert active.sender.lag().reason == reason
         active.epoch = 6
-        await active.sender.acknowledged(2)
+        await active.sender.until_acknowledged(2)
         await require_equal(tmp_path, active)
         assert standby.replica.position.epoch == 6
 
@@ -314,7 +314,7 @@ async def test_a_new_link_ends_the_earlier_one(tmp_path: Path) -> None:
         await silent.receive(10)
         async with standby_side(tmp_path, active):
             active.database.put("thing", "a", 1, None)
-            await active.sender.acknowledged(1)
+            await active.sender.until_acknowledged(1)
             with pytest.raises(ReplicationError):
                 while True:
                     await silent.receive(10)
@@ -344,7 +344,7 @@ async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.
 async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
     async with active_side(tmp_path) as active:
         active.database.put("thing", "a", 1, None)
-        waiting = asyncio.create_task(active.sender.acknowledged(1))
+        waiting = asyncio.create_task(active.sender.until_acknowledged(1))
         await until(lambda: active.sender.lag().waiting_since is not None)
         async with connected(tmp_path, active) as link:
             await link.send(Stored(0, "", 0))
@@ -401,7 +401,7 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
                     await link.close()
             assert not active.sender.lag().connected
         async with standby_side(tmp_path, active):
-            await active.sender.acknowledged(0)
+            await active.sender.until_acknowledged(0)
             await until(lambda: active.sender.lag().caught_up)
 
 
@@ -511,10 +511,10 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
         asyncio.create_task(ReplicationReceiver(replica, lambda _epoch: True).follow(*others)),
     ]
     async with asyncio.timeout(SECONDS):
-        await sender.acknowledged(store.database.number)
+        await sender.until_acknowledged(store.database.number)
         save("2")
         store.forget_incarnation("1")
-        await sender.acknowledged(store.database.number)
+        await sender.until_acknowledged(store.database.number)
     sender.close()
     await asyncio.gather(*tasks, return_exceptions=True)
     replica.close()
@@ -557,7 +557,7 @@ async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_
         for number, change in enumerate(changes, 1):
             store.save_setting("name", "value")
             change()
-            await sender.acknowledged(store.database.number)
+            await sender.until_acknowledged(store.database.number)
             assert sender.lag().obstacle == f"check {number}"  # with what it acknowledges
             assert (len(revisions), revisions[-1]) == (number, store.database.number)
         for obstacle in ("other keys", "x" * 600, ""):
@@ -634,7 +634,7 @@ async def test_a_change_too_large_for_a_frame_is_an_error_with_a_remedy(
         assert "a change has 200034 bytes, and the standby gets at most 100000" in active.sender.lag().reason
         assert standby.replica.position.number == 0
         active.database.put("tree", 1, bytes(20_000), 1.0)
-        await active.sender.acknowledged(2)
+        await active.sender.until_acknowledged(2)
         await require_equal(tmp_path, active)
 
 
@@ -732,7 +732,7 @@ async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link
     ends, others = await pair_of_streams()
     tasks = [asyncio.create_task(sender.serve(*ends)), asyncio.create_task(receiver.follow(*others))]
     async with asyncio.timeout(SECONDS):
-        await sender.acknowledged(store.database.number)
+        await sender.until_acknowledged(store.database.number)
         for reason in ("b is blind", ""):
             order = asyncio.create_task(receiver.want_switchover())
             await wanted.wait()

@@ -79,6 +79,6 @@ def test_only_monitors_in_force_keep_state(settings: Settings) -> None:
     """A monitor that is disabled or in shadow mode holds nothing after a takeover."""
     holds, stateless = StateOwner("1", frozenset({"/cmd_vel"}), ""), StateOwner("2", frozenset(), "")
     switches = Switches(states={"gun": True, "arm": False, "leg": "shadow"})
-    assert holds_if_lost({"gun": holds, "arm": stateless}, switches.enabled)
-    assert not holds_if_lost({"gun": stateless, "arm": holds, "leg": holds}, switches.enabled)
+    assert holds_if_lost({"gun": holds, "arm": stateless}, switches.is_enabled)
+    assert not holds_if_lost({"gun": stateless, "arm": holds, "leg": holds}, switches.is_enabled)
     assert report_of(settings, keeps_state=True).now().keeps_state

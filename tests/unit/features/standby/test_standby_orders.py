@@ -65,7 +65,7 @@ async def test_a_standby_answers_nothing_else() -> None:
         assert answer.error == "this appliance is the standby of b (10.0.0.2); give the command there"
     assert (
         await handler.carry_out(standby_requests.StandbyWanted(), who="operator")
-    ).given() == member.state()
+    ).unwrap() == member.state()
     assert member.did == []
 
 
@@ -81,4 +81,4 @@ async def test_only_the_admin_socket_of_a_standby_orders_a_switchover() -> None:
     member.refusal = ""
     assert (
         await handler.carry_out(standby_requests.StandbyPromote(), who="operator")
-    ).given().role == "active"
+    ).unwrap().role == "active"

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from appliance.base import clock
-from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.base.withdrawal import WithdrawnError, withdrawable
 from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.orders import ActiveAppliance
@@ -110,7 +110,7 @@ async def test_a_slow_link_refuses_the_order_before_anything_is_paused(active: A
 
 
 async def test_an_order_whose_client_left_during_the_check_pauses_nothing(active: Active) -> None:
-    with awaited(lambda: True), pytest.raises(WithdrawnError):
+    with withdrawable(lambda: True), pytest.raises(WithdrawnError):
         await active.order.hand_over()
     assert active.steps() == ["rehearse"]
 

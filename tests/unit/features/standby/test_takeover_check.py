@@ -66,7 +66,7 @@ class Standby:
         compiler: SpecificationCompiler | None = None,
         **settings: Any,
     ) -> AsyncIterator["Checked"]:
-        await self.store.settled()
+        await self.store.until_settled()
         given: dict[str, Any] = {
             "listen": "127.0.0.1:0",
             "isolation": "none",
@@ -105,7 +105,7 @@ class Checked:
         return self.check.obstacle
 
     async def replicate(self) -> None:
-        await self._store.settled()
+        await self._store.until_settled()
         self.check.note_news()
 
 
@@ -292,7 +292,7 @@ async def test_a_takeover_compiles_nothing(standby: Standby, monkeypatch: pytest
     standby.store.save_monitor_revision(MonitorRevisionRow(1, text_of(Sources(files)), 0.0, "alice", ""))
     standby.store.save_setting(SWITCHES, json.dumps({"b": "shadow"}))
     compiler = SpecificationCompiler(lambda: None)
-    monkeypatch.setattr(compiler, "_asked", asked)
+    monkeypatch.setattr(compiler, "_ask", asked)
     async with standby.checked(relays=2, compiler=compiler) as checked:
         for _ in range(2):
             assert await checked.next_obstacle() == ""
@@ -311,7 +311,7 @@ async def test_a_takeover_compiles_nothing(standby: Standby, monkeypatch: pytest
     other.check_at_start, other.parts = compiler.check_at_start, compiler.parts
     manager = await other.monitors(taken_over=True)
     assert manager.rollout.allocation.of_file("a.rv") != manager.rollout.allocation.of_file("b.rv")
-    assert manager.switches.shadowed() == ["b"]
+    assert manager.switches.shadowed_monitors() == ["b"]
     assert len(questions) == 2
     other.log.close()
 

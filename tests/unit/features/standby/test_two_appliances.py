@@ -74,7 +74,7 @@ async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateS
     await SharedAuthority(near(tmp_path, "a"), store.hosts).revocations([])
     own = near(tmp_path, "b")
     alone = StoredAuthority(own, store.hosts)
-    assert await alone.certificate() == (await own.stated()).certificate
+    assert await alone.certificate() == (await own.statement()).certificate
     assert await alone.obstacle() == ""
 
 
@@ -143,10 +143,10 @@ async def test_a_replaced_appliance_is_revoked(
     await first.introduce(further, authority)
     assert first.certificate(stolen.key) == first.certificate(replacement.key) == b""
     assert first.certificate(further.key)
-    assert len(store.hosts.revoked()) == 2
+    assert len(store.hosts.revoked_certificates()) == 2
     Appliances(store.hosts, RevokedCertificates(store.hosts))
     assert store.hosts.appliances() == []
-    assert len(store.hosts.revoked()) == 3
+    assert len(store.hosts.revoked_certificates()) == 3
 
 
 async def test_an_appliance_with_the_same_address_is_not_taken(tmp_path: Path, store: StateStore) -> None:

@@ -94,7 +94,7 @@ def test_an_unexpected_answer_names_the_request(charon: tuple[StandIn, ViciClien
     stand_in, vici = charon
     stand_in.events = bytes([Packet.CMD_RESPONSE])
     with pytest.raises(CharonError, match="the list of tunnels"):
-        vici.seen()
+        vici.list_tunnels()
 
 
 def test_a_list_that_is_too_long_is_an_error(charon: tuple[StandIn, ViciClient]) -> None:
@@ -109,7 +109,7 @@ def test_unwanted_tunnels_are_closed_at_each_check(charon: tuple[StandIn, ViciCl
     vici.provision(stated(1))
     stand_in.standing = [Standing(connection_name("gone"), 1, 1), Standing("(unnamed)", 2, 2)]
     for _ in range(2):
-        assert [one.name for one in vici.seen()] == ["gone"]
+        assert [one.name for one in vici.list_tunnels()] == ["gone"]
         assert stand_in.ended("ike") == [connection_name("gone")]
 
 
@@ -127,10 +127,10 @@ def test_tunnels_of_a_replaced_certificate_are_closed_at_each_check(
     after = Standing(tunnel, 6, 10)
     for anew in (before, before, Standing(tunnel, 5, 7), Standing(tunnel, 5, 9)):
         stand_in.standing = [after, anew, other]
-        vici.seen()
+        vici.list_tunnels()
         assert stand_in.ended("ike-id") == [str(anew.ike)]
     stand_in.standing = [after, other]
-    vici.seen()
+    vici.list_tunnels()
     assert stand_in.ended("ike-id") == []
 
 
@@ -139,9 +139,9 @@ def test_a_tunnel_is_seen_while_its_keys_are_replaced(charon: tuple[StandIn, Vic
     tunnel = connection_name("laptop")
     vici.provision(msgspec.structs.replace(stated(1), hosts=[TunnelHost("laptop", "10.113.11.2", "1a")]))
     stand_in.standing = [Standing(tunnel, 3, 7, "REKEYING")]
-    assert [one.name for one in vici.seen()] == ["laptop"]
+    assert [one.name for one in vici.list_tunnels()] == ["laptop"]
     stand_in.standing = [Standing(tunnel, 3, 0, "REKEYED")]
     stand_in.later = [[Standing(tunnel, 4, 7), Standing(tunnel, 3, 0, "REKEYED")]]
-    assert [one.name for one in vici.seen()] == ["laptop"]
+    assert [one.name for one in vici.list_tunnels()] == ["laptop"]
     stand_in.standing = [Standing(tunnel, 4, 0, "REKEYED")]
-    assert vici.seen() == []
+    assert vici.list_tunnels() == []

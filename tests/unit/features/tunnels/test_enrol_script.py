@@ -11,7 +11,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 
-from appliance.features.tunnels.enrolment_kit import filled
+from appliance.features.tunnels.enrolment_kit import fill
 from appliance.ipsec.certificate_authority import CertificateAuthority
 
 pytestmark = pytest.mark.nightly
@@ -74,7 +74,7 @@ class Host:
     def run(self, token_id: str, *arguments: str, said: str = "") -> subprocess.CompletedProcess[str]:
         values = {"name": "laptop", "url": "https://10.0.0.1:8443", "pin": "sha256//x", "id": token_id}
         script = self._home / f"join-{token_id}.sh"
-        script.write_text(filled("enrol.sh", values | {"authority": self._authority}))
+        script.write_text(fill("enrol.sh", values | {"authority": self._authority}))
         path = f"{self._programs}:{os.environ['PATH']}"
         environment = {"PATH": path, "HOME": str(self._home), "ROSRV_FOLDER": str(self.folder)}
         command = ["sh", str(script), *arguments]

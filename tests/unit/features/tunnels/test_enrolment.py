@@ -264,7 +264,7 @@ def test_no_host_keeps_an_address_outside_the_pool(tmp_path: Path) -> None:
 
     async def after(bench: Bench) -> None:
         await bench.tunnels.start()
-        found = bench.table.admitted(), bench.tunnels.addresses, bench.table.at("10.113.11.2")
+        found = bench.table.admitted_hosts(), bench.tunnels.addresses, bench.table.at("10.113.11.2")
         assert found == ([], {}, None)
         why = "a has 10.113.11.2, outside ipsec.pool (10.113.12.0/29), and cannot connect"
         assert why in bench.hosts.status().troubles[0]
@@ -297,7 +297,7 @@ async def test_a_revoked_host_leaves_the_policy_first(bench: Bench) -> None:
     body = await bench.revoke("a")
     assert bench.order == ["policy []", "expel 10.113.11.2"]
     assert body.taken_back == 3
-    assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
+    assert [row.serial for row in bench.store.hosts.revoked_certificates()] == [body.serial]
     with pytest.raises(HostRefusedError, match="enrol it: rosrv host add NAME"):
         await bench.revoke("a")
 
@@ -308,7 +308,7 @@ async def test_a_new_certificate_revokes_the_one_before(bench: Bench) -> None:
         await bench.add("a")
     second = await bench.renew("a")
     assert second.address == first.address
-    assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
+    assert [row.serial for row in bench.store.hosts.revoked_certificates()] == [first.serial]
 
 
 async def test_a_bad_request_enrols_no_host(bench: Bench) -> None:
@@ -364,7 +364,7 @@ def test_a_host_that_lost_the_answer_gets_it_again(tmp_path: Path, *, new: bool)
         present = bench.hosts.rows()[0].serial
         kit = await bench.hosts.itself.enrol(given)
         assert (kit.serial, kit.kept["endpoint"]) == (present, "10.0.0.1")
-        assert len(bench.store.hosts.revoked()) == (not new)
+        assert len(bench.store.hosts.revoked_certificates()) == (not new)
         with pytest.raises(HostForbiddenError, match="already used"):  # with another key
             await bench.enrol(token[0], "a")
 
@@ -496,9 +496,9 @@ async def test_a_host_renews_itself(bench: Bench) -> None:
     )
     assert made.serial != first.serial
     assert bench.hosts.rows()[0].renewing
-    assert bench.store.hosts.revoked() == []
+    assert bench.store.hosts.revoked_certificates() == []
     await bench.renewed("a")
-    assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
+    assert [row.serial for row in bench.store.hosts.revoked_certificates()] == [first.serial]
     assert bench.hosts.rows()[0].serial == made.serial
     with pytest.raises(HostRefusedError, match="renew first"):
         await bench.renewed("a")
@@ -565,7 +565,7 @@ async def test_revoking_during_a_renewal_revokes_both_certificates(bench: Bench)
     request = request_of("a")
     made = await bench.renew_itself("a", request, key)
     await bench.revoke("a")
-    assert {row.serial for row in bench.store.hosts.revoked()} == {first.serial, made.serial}
+    assert {row.serial for row in bench.store.hosts.revoked_certificates()} == {first.serial, made.serial}
     with pytest.raises(HostForbiddenError):
         await bench.renewed("a")
     again = await bench.add("a")
@@ -605,7 +605,7 @@ async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: py
 
 
 async def test_a_change_for_another_state_is_refused(bench: Bench) -> None:
-    seen = (await bench.hosts.listed(HostList())).revision
+    seen = (await bench.hosts.list_hosts(HostList())).revision
     await bench.add("a")
     for late in (
         bench.hosts.revoke(HostRevoke("a", seen), "tester"),
@@ -615,7 +615,7 @@ async def test_a_change_for_another_state_is_refused(bench: Bench) -> None:
     ):
         with pytest.raises(HostsChangedError):
             await late
-    await bench.hosts.revoke(HostRevoke("a", (await bench.hosts.listed(HostList())).revision), "tester")
+    await bench.hosts.revoke(HostRevoke("a", (await bench.hosts.list_hosts(HostList())).revision), "tester")
 
 
 @pytest.mark.parametrize("name", ["a.b-c_d", "0", "x" * 63, "con.fig", "host-a"])
@@ -634,7 +634,7 @@ def test_two_hundred_hosts(tmp_path: Path) -> None:
 
     async def again(bench: Bench) -> None:
         assert len(bench.hosts.rows()) == 200
-        assert len(bench.table.admitted()) == 200
+        assert len(bench.table.admitted_hosts()) == 200
 
     run(tmp_path, work, pool="10.113.0.0/16")
     run(tmp_path, again, pool="10.113.0.0/16")
@@ -703,7 +703,7 @@ async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
         await bench.hosts.ports.tell(HostPorts("nobody", "open", [], 5.0), "eve")
     with pytest.raises(HostRefusedError, match="a day in the future"):
         await bench.hosts.ports.tell(HostPorts("a", "closed", [], 4e9), "eve")
-    overview = await bench.hosts.listed(HostList())
+    overview = await bench.hosts.list_hosts(HostList())
     assert overview.hosts[0].ports == PortsSeen("open", 5.0, [40001], "eve")
     assert [(machine.address, machine.nodes, machine.ports.state) for machine in overview.machines] == [
         ("10.0.0.7", 3, "closed")
@@ -728,7 +728,7 @@ async def test_removing_a_host_answers_once_its_connections_are_closed(
     asked = asyncio.ensure_future(
         hosts.revoke(order, "alice") if isinstance(order, HostRevoke) else hosts.reload(order, "alice")
     )
-    await bench.store.settled()
+    await bench.store.until_settled()
     for _ in range(10):
         await asyncio.sleep(0)
     assert not asked.done()
@@ -860,7 +860,7 @@ def test_a_full_disk_during_enrolment_names_the_way_out(
 
     async def work(bench: Bench) -> None:
         with monkeypatch.context() as patched:
-            patched.setattr(bench.store, "settled", full)
+            patched.setattr(bench.store, "until_settled", full)
             with pytest.raises(
                 StoreError, match=r"^state\.db: full; make room; .*no kit: rosrv host kit a, or revoke"
             ):
@@ -884,9 +884,9 @@ def test_without_the_authoritys_key_changes_wait(tmp_path: Path, monkeypatch: py
             with pytest.raises(HostRefusedError, match="new certificates wait") as caught:
                 await order
             assert caught.value.ours
-        assert bench.store.hosts.revoked() == []
+        assert bench.store.hosts.revoked_certificates() == []
         await bench.revoke("b")
-        assert [row.name for row in bench.table.enrolled()] == ["a"]
+        assert [row.name for row in bench.table.hosts()] == ["a"]
 
     async def obstacle(_authority: StoredAuthority) -> str:
         return "new certificates wait"

@@ -1,7 +1,7 @@
 from appliance.channel import admin
 from appliance.channel.admin import operation_of
 from appliance.channel.messages.api import ClientRequest
-from appliance.channel.rest_meaning import meant
+from appliance.channel.rest_meaning import order_of
 from appliance.features.tunnels.requests import HostPorts, HostToken
 
 
@@ -14,4 +14,4 @@ def test_a_kind_of_request_can_have_several_ways() -> None:
 def test_a_date_is_seconds() -> None:
     body = b'{"state": "open", "checked": "2026-03-01T00:00:00.5Z"}'
     ports = ClientRequest("10.0.0.1", "PUT", "/v1/hosts/laptop/ports", "*", "application/json", "", body)
-    assert meant(ports) == HostPorts("laptop", "open", checked=1_772_323_200.5)
+    assert order_of(ports) == HostPorts("laptop", "open", checked=1_772_323_200.5)

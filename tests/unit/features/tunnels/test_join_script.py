@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
-from appliance.features.tunnels.enrolment_kit import filled
+from appliance.features.tunnels.enrolment_kit import fill
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network.close_ports import RANGE_FILE, protection
@@ -57,7 +57,7 @@ class Machine:
         (root / "x509/rosrv.pem").write_bytes(made)
 
     def keeps_what_is_in_place(self) -> bool:
-        text = filled("join.sh", defaultdict(str, name="laptop"))
+        text = fill("join.sh", defaultdict(str, name="laptop"))
         begin, end = text.index("begin() {"), text.index("\n}\n", text.index("renewed() {")) + 3
         script = text[begin:end].replace("/etc/swanctl", str(self._etc)) + "renewed\n"
         done = ran("sh", "-eu", "-c", script, path=self._path, cwd=self._kit.parent)
@@ -98,7 +98,7 @@ def test_a_machine_with_other_ports_than_the_kit_is_warned(
 ) -> None:
     """The kernel's own file is read: a shell that reads it byte by byte gets only the first one."""
     first, last = map(int, RANGE_FILE.read_text().split())
-    text = filled("join.sh", defaultdict(str, name="laptop"))
+    text = fill("join.sh", defaultdict(str, name="laptop"))
     begin, end = text.index("closed=$("), text.index("\nfi\n", text.index("closed=$(")) + 4
     say = "".join(line for line in text.splitlines(True) if line.startswith("say()"))
     ports = PortRange(first + closed[0], last + closed[1])
@@ -112,9 +112,7 @@ def test_a_machine_with_other_ports_than_the_kit_is_warned(
 
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
 def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str, status: int) -> None:
-    text = filled(
-        "join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2", connections="rosrv rosrv-2")
-    )
+    text = fill("join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2", connections="rosrv rosrv-2"))
     begin, end = text.index('say "waiting for'), text.index("\nfi\n", text.index("INSTALLED")) + 4
     functions = "".join(line for line in text.splitlines(True) if line.startswith(("die()", "say()")))
     swanctl = tmp_path / "swanctl"
@@ -131,7 +129,7 @@ def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str
 
 
 def test_a_long_log_begins_again(tmp_path: Path) -> None:
-    (line,) = [one.strip() for one in filled("join.sh", defaultdict(str)).splitlines() if "for log in" in one]
+    (line,) = [one.strip() for one in fill("join.sh", defaultdict(str)).splitlines() if "for log in" in one]
     long, short = tmp_path / "charon.log", tmp_path / "keep.log"
     long.write_bytes(b"x" * 1_000_000)
     short.write_bytes(b"x" * 999_999)
@@ -183,7 +181,7 @@ def test_a_failed_run_leaves_a_joined_host_its_keeper(
     for name in ("id", "dpkg-query", "nft", "ip", "systemctl", "setsid", "swanctl", "ping", "curl", "sleep"):
         Path("bin", name).write_text(PROGRAM.format(failure=FAILURES[failure], root=tmp_path))
         Path("bin", name).chmod(0o755)
-    script = filled("join.sh", defaultdict(str, name="laptop", connections="rosrv"))
+    script = fill("join.sh", defaultdict(str, name="laptop", connections="rosrv"))
     Path("join.sh").write_text(re.sub(r"(?<![\w/])/(?=(etc|run)/)", f"{tmp_path}/", script))
     with socket.socket(socket.AF_UNIX) as charon:
         charon.bind("socket")

@@ -9,7 +9,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
 
-from appliance.features.tunnels.enrolment_kit import filled
+from appliance.features.tunnels.enrolment_kit import fill
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -50,7 +50,7 @@ class Host:
         for name, text in (("curl", CURL), ("swanctl", "#!/bin/sh\n")):
             self.program(name, text)
         values = {"name": "laptop", "rest": "https://10.113.11.1:8443", "pin": "sha256//x"}
-        (folder / "renew.sh").write_text(filled("renew.sh", values))
+        (folder / "renew.sh").write_text(fill("renew.sh", values))
         self._script = folder / "renew.sh"
 
     def program(self, name: str, text: str) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from appliance.master.calls.call import CALLER_API, SERVICE_API, ApiUri, Attempt, Caller, RosCall
 from appliance.master.calls.call_table import MASTER_CALLS
-from appliance.master.calls.gate import CallGate, HostLimits, NameConflict, contested
+from appliance.master.calls.gate import CallGate, HostLimits, NameConflict, decide_contest
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.reconcile.liveness import Presence, Probe
@@ -98,9 +98,9 @@ def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
 def test_only_a_probe_of_the_present_holder_decides_a_contest() -> None:
     holder, other = (next(iter(held(name, ADMIN, own=False).live())) for name in ("/voice", "/other"))
     contest = NameConflict(holder, Decision(True, None, "granted"))
-    assert contested(contest, Probe(holder, Presence.GONE, 7.2)).allowed
-    assert not contested(contest, Probe(other, Presence.GONE, 7.2)).allowed
-    assert not contested(contest, None).allowed
+    assert decide_contest(contest, Probe(holder, Presence.GONE, 7.2)).allowed
+    assert not decide_contest(contest, Probe(other, Presence.GONE, 7.2)).allowed
+    assert not decide_contest(contest, None).allowed
 
 
 def register(gate: CallGate, number: int, topic: str, name: str) -> Decision:

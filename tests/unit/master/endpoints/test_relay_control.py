@@ -66,7 +66,7 @@ class World:
             2,
             lambda node, topic: self.cut_off.append((node.name, topic)),
         )
-        self.grants = Grants(self.registry.mark, carried.used, grants)
+        self.grants = Grants(self.registry.mark, carried.used_permissions, grants)
         return RelayControl(
             self.registry,
             self.grants,

@@ -35,7 +35,7 @@ async def store_publisher_of_secret(folder: Path) -> None:
     answer: Any = await before.ask("registerPublisher", "/n", "/secret", "std_msgs/String", URI)
     assert answer[0] == 1
     await before.settle()
-    await store.settled()
+    await store.until_settled()
     store.close()
 
 

@@ -15,7 +15,7 @@ DEFINED = {"type": STRING, "md5sum": MD5, "message_definition": "string data\n"}
 def asked(claims: list[dict[str, str]], registered: str) -> list[str]:
     candidates = HeaderCandidates(lambda: claims, lambda: registered)
     shown = [_shown(candidates)]
-    while candidates.refused():
+    while candidates.advance():
         shown.append(_shown(candidates))
     assert _shown(candidates) == shown[0]  # from the start, at the next attempt
     return shown
@@ -51,10 +51,10 @@ def test_subscribers_do_not_choose_how_often_a_publisher_is_asked() -> None:
 
 def test_an_accepted_header_is_used_again() -> None:
     candidates = HeaderCandidates(lambda: [SUBSCRIBER], lambda: STRING)
-    assert candidates.refused()
+    assert candidates.advance()
     candidates.accepted()
     assert (candidates.fields["type"], candidates.fields["md5sum"]) == (STRING, MD5)
-    assert candidates.refused()  # the publisher has changed its mind: another claim is left
+    assert candidates.advance()  # the publisher has changed its mind: another claim is left
     assert candidates.fields["md5sum"] == "*"
 
 
@@ -71,7 +71,7 @@ def test_each_type_of_a_subscriber_is_tried_in_turn(types: int, alike: int, host
 
     def next_row() -> list[str]:
         row = []
-        while candidates.refused():
+        while candidates.advance():
             row.append(candidates.fields["md5sum"])
         return row
 
@@ -90,6 +90,6 @@ def test_a_host_that_makes_up_types_hides_no_subscriber_of_another() -> None:
         member.fields = {"type": "a/B", "md5sum": str(number)}
         story.topic.join(member)
     candidates = HeaderCandidates.of(context_of(loop), story.topic)
-    asked_for = [candidates.fields["md5sum"] for _ in range(3) if candidates.refused()]
+    asked_for = [candidates.fields["md5sum"] for _ in range(3) if candidates.advance()]
     assert asked_for == ["0", "99", "1"]
     loop.close()

@@ -220,7 +220,7 @@ def _shipped_traffic(seed: int) -> list[Traffic]:
 
 
 def test_shipped_monitors_do_the_same_together() -> None:
-    known = definitions().extended(
+    known = definitions().merge(
         Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": "Header header\nuint8 trigger\n"})
     )
     texts = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}

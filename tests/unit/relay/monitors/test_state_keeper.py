@@ -33,7 +33,7 @@ STOP = """{modifier} stop() {{
 
 def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) -> StateKeeper:
     keeper = StateKeeper(given, memory)
-    left = keeper.recovered()
+    left = keeper.recover()
     if left is None:
         monitors.start(0)
     else:
@@ -181,7 +181,7 @@ def test_a_newer_state_that_is_lost_is_not_replaced_by_an_older_one() -> None:
     press(second := stop(), begun(second, newer, OTHERS["a power cut"]))
     for memories in ([older, newer], [newer, older]):
         keeper = StateKeeper(GIVEN, bytearray(SIZE), memories)
-        left = keeper.recovered()
+        left = keeper.recover()
         assert left is not None
         third = stop()
         third.recover(left.groups, left.lost, 0)

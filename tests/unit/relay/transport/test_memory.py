@@ -44,7 +44,7 @@ def test_the_memory_of_a_relay_is_parted_as_the_table_says() -> None:
     wholes = [one.bounds.whole >> 20 for one in (memory.frames, memory.queues, memory.latched)]
     assert wholes == [128, 64, 64]
     assert take_all(memory.latched, "a", 1 << 20) == 32 << 20
-    assert memory.held() == {"frames": 0, "queues": 0, "latched": 32 << 20, "headers": 0}
+    assert memory.bytes_held() == {"frames": 0, "queues": 0, "latched": 32 << 20, "headers": 0}
 
 
 def test_a_host_that_is_gone_leaves_nothing() -> None:
@@ -56,6 +56,6 @@ def test_a_host_that_is_gone_leaves_nothing() -> None:
 
 def test_a_stall_is_what_does_not_change() -> None:
     stall = StallDetector(10)
-    assert not any(stall.seen(held, now) for held, now in ((5, 0), (5, 10), (6, 11), (6, 21)))
-    assert stall.seen(6, 21.5)
-    assert not any(stall.seen(held, now) for held, now in ((0, 22), (6, 40), (6, 50)))
+    assert not any(stall.has_stalled(held, now) for held, now in ((5, 0), (5, 10), (6, 11), (6, 21)))
+    assert stall.has_stalled(6, 21.5)
+    assert not any(stall.has_stalled(held, now) for held, now in ((0, 22), (6, 40), (6, 50)))
