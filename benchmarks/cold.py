@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from appliance.supervisor.roles import ROLES
-from benchmarks.launch import findings, table_ratios
+from benchmarks.launch import LONE, findings, table_ratios
 from benchmarks.monitors import CopyingRelay, MinimalRelay, specification
 from benchmarks.relay_throughput import HERE, TYPE, Direct, LoadApi, Result, System, run
 from tests.support.appliance import Appliance
@@ -47,7 +47,6 @@ default = 127.0.0.1
 """
 BASE = "C with epoll"
 NICENESS = next(role.nice for role in ROLES if role.name == "relay")
-LONE = "ordinary priority"  # the table's column in RESULTS.md
 SECONDS = {"paced": 2.0, "window": 0.4}
 SIZES = {"paced": (200,), "window": (200, 4096, 65536, 1048576, 4194304)}
 MODES = ("paced100", "paced1000", "window")

@@ -55,6 +55,7 @@ from tests.support.rosmaster import PlainMaster, free_port
 
 HERE = Path(__file__).parent / "nodes"
 RESULTS = Path(__file__).with_name("RESULTS.md")
+LONE = "ordinary priority"  # the column of `benchmarks/cold.py` there
 _CONTAINED = (
     "setpriv", "--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child", "--mount-proc",
     sys.executable, "-m", "benchmarks.launch",

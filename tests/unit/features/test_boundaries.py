@@ -16,6 +16,10 @@ from appliance.features.table import member
 ROOT = Path(__file__).parents[3]
 FOLDERS = sorted(path.parent.name for path in (ROOT / "appliance/features").glob("*/feature.py"))
 _FEATURE = re.compile(r"\bappliance\.features\.(\w+)")
+_OURS = re.compile(
+    r"^(?:from|import) ((?:benchmarks|distribution|lab|tests)\b[\w.]*)(?: import ([\w, ]+))?", re.MULTILINE
+)
+UNIT = ROOT / "tests/unit"
 WORLD = ROOT / "tests/world"  # simulates the whole product, also as one of two appliances
 
 
@@ -34,13 +38,25 @@ OF_MANY = {
 
 
 @cache
+def _named(file: Path) -> tuple[set[str], list[Path]]:
+    """Return the features that a file names, and the files outside of the products that it imports."""
+    text = file.read_text(encoding="utf-8")
+    imports = ((ROOT / module.replace(".", "/"), names.split(", ")) for module, names in _OURS.findall(text))
+    files = [(module / name).with_suffix(".py") for module, names in imports for name in ("", *names)]
+    return set(_FEATURE.findall(text)), [one for one in files if one.is_file() and WORLD not in one.parents]
+
+
+@cache
 def features_in_tests() -> dict[str, set[str]]:
-    """Return the features that each file of tests names, outside of the world."""
-    return {
-        str(path.relative_to(ROOT)): set(_FEATURE.findall(path.read_text(encoding="utf-8")))
-        for path in (ROOT / "tests").rglob("*.py")
-        if WORLD not in path.parents
-    }
+    """Return the features that each file of tests names, outside of the world; a unit test also through its imports."""
+    found = {}
+    for path in (ROOT / "tests").rglob("*.py"):
+        if WORLD not in path.parents:
+            files = [path]
+            for file in files if UNIT in path.parents else ():
+                files.extend(set(_named(file)[1]).difference(files))
+            found[str(path.relative_to(ROOT))] = {name for file in files for name in _named(file)[0]}
+    return found
 
 
 @pytest.mark.parametrize("name", FOLDERS)

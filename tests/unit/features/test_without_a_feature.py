@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.table import NAMES
+from tests.unit.features.test_boundaries import OF_MANY, features_in_tests
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1200)]
 ROOT = Path(__file__).parents[3]
@@ -22,8 +23,9 @@ for module in pkgutil.walk_packages(appliance.__path__, "appliance."):
 
 def without(name: str, copy: Path) -> None:
     files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    of_many = [file for file in OF_MANY if name in features_in_tests()[file]]
     for file in filter(None, files.decode().split("\0")):
-        if f"/features/{name}/" not in file and (ROOT / file).is_file():
+        if f"/features/{name}/" not in file and file not in of_many and (ROOT / file).is_file():
             (copy / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / file, copy / file)
     for built in (ROOT / "appliance").rglob("*.so"):

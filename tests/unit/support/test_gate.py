@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.cold import LONE
-from benchmarks.launch import RESULTS, findings, table_ratios
+from benchmarks.launch import LONE, RESULTS, findings, table_ratios
 from tests import nightly
 from tests.gate import digest
 from tests.nightly import (

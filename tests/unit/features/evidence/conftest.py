@@ -1,7 +1,7 @@
 import asyncio
 import hashlib
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 import pytest
@@ -13,7 +13,7 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest, answer_to, verb_of
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.channel.operations import AnyRequest
+from appliance.channel.operations import request_named
 from appliance.features.evidence.bundle import RecordingSelection, TimeSpan, export
 from appliance.features.evidence.control_part import EvidenceOrders, NotSealedError
 from appliance.features.evidence.page import Names
@@ -38,9 +38,6 @@ LENGTHS = (0, 1, 31, 32, 255, 256, 4000)
 NUMBERS = (
     0, 1, -1, -32, -33, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**63 - 1, -128, -129, -(2**31) - 1,
 )  # fmt: skip
-
-
-[FETCH] = [kind for kind in get_args(AnyRequest) if kind.__struct_config__.tag == "recording fetch"]
 
 
 class Control:
@@ -78,8 +75,9 @@ class Control:
 
     def record(self, folder: Path, bag: bytes, **about: Any) -> RecordingSelection:
         digest = hashlib.sha256(bag).hexdigest()
+        fetch: Any = request_named("recording fetch")
         recording: Any = example(
-            answer_to(FETCH), id="ab" * 10, began=self.begun, ended=wall_ns(), sha256=digest, **about
+            answer_to(fetch), id="ab" * 10, began=self.begun, ended=wall_ns(), sha256=digest, **about
         )
         self.trail.happened("recording closed", "complete", recording=recording.id, sha256=digest)
         (folder / recording.id).mkdir()
