@@ -171,7 +171,7 @@ def quoted(seen: Sequence[Seen]) -> Iterator[str]:
     program = "\n".join(one.what for one in seen)
     for page_name, one in [
         *(("troubleshooting", message) for message in messages),
-        *(("reference/tunnels", end) for end in ends),
+        *(("reference/tunnels", end) for end in ends if _is_here("appliance/features/tunnels/")),
     ]:
         if one not in program:
             yield f"docs/{page_name}.md: {one!r} is in no string of the appliance: quote what it prints"

@@ -105,13 +105,6 @@ def test_monitors_to_enable_as_a_list(file: Path) -> None:
     ]
 
 
-def test_a_wrong_key_of_a_mapping_is_named_with_the_valid_ones(file: Path) -> None:
-    file.write_text("sso:\n  roles:\n    operators: [x]\n")
-    (found,) = mistakes(file)
-    assert found.startswith(f"{file}:3: sso.roles: the key 'operators': must be 'viewer', ")
-    assert "[key]" not in found
-
-
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
     file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
     assert mistakes(file) == [f"{file}:3: relays is given twice"]

@@ -19,7 +19,7 @@ READER = Role("reader", "rosrv-syslog", "reader", "reader:main", dispensable=Tru
     [
         (["api"], {"api"}),
         (["reader"], {"reader"}),
-        (["api", "reader", "relay", "control", "charon", "signer"], {"api", "reader"}),
+        (["api", "reader", "relay", "control", "signer"], {"api", "reader"}),
         (["relay"], set()),
         ([-1], {"api", "reader"}),
         ([4_200_000], {"api", "reader"}),

@@ -7,6 +7,7 @@ from pydantic import TypeAdapter, ValidationError
 from appliance.features.sso.errors import ProviderError
 from appliance.features.sso.provider_connection import ProviderConnection
 from appliance.features.sso.settings import Sso
+from tests.unit.configuration.test_config_sources import mistakes
 from tests.unit.features.sso.scripted_provider import sso
 
 GOOD: dict[str, Any] = {
@@ -49,6 +50,14 @@ def test_a_wrong_setting_is_refused_with_its_reason(change: dict[str, Any], reas
     with pytest.raises(ValidationError) as refused:
         TypeAdapter(Sso).validate_python(GOOD | change)
     assert reason in str(refused.value)
+
+
+def test_a_wrong_key_of_a_mapping_is_named_with_the_valid_ones(tmp_path: Path) -> None:
+    file = tmp_path / "appliance.yaml"
+    file.write_text("sso:\n  roles:\n    operators: [x]\n")
+    (found,) = mistakes(file)
+    assert found.startswith(f"{file}:3: sso.roles: the key 'operators': must be 'viewer', ")
+    assert "[key]" not in found
 
 
 def test_the_firewall_lets_the_process_reach_the_provider_or_the_proxy_only() -> None:
