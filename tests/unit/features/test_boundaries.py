@@ -29,6 +29,7 @@ def test_each_folder_is_a_row() -> None:
 
 OF_MANY = {
     "tests/integration/test_denials.py": "denials count wherever a feature shows them",
+    "tests/integration/test_losses.py": "calls that wait for an approval end with a loss, like all else",
     "tests/integration/test_own_log.py": "each process gets a log that cannot be written",
     "tests/unit/cli/test_watching.py": "each verb that watches gets the same rejections",
     "tests/unit/control/test_motion_stop.py": "each right that a restart ends is stopped by the same work",
