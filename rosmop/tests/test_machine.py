@@ -279,9 +279,9 @@ def test_many_machines_need_few_addresses() -> None:
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import resource, wasmtime
-from rosmop.fast.wasm_instance import WasmInstance, translated
+from rosmop.fast.wasm_instance import WasmInstance, translate
 code = bytes(wasmtime.wat2wasm('(module (memory (export "memory") 1) (func (export "f") unreachable))'))
-code = translated(code, 1 << 20)
+code = translate(code, 1 << 20)
 WasmInstance(code, 1 << 20)
 had = int(open("/proc/self/statm").read().split()[0]) * {resource.getpagesize()}
 resource.setrlimit(resource.RLIMIT_AS, (had + (400 << 20), had + (400 << 20)))
@@ -303,9 +303,9 @@ def test_traps_come_without_signals() -> None:
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import faulthandler, wasmtime
-from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translate
 code = bytes(wasmtime.wat2wasm({f'(module (memory (export "memory") 1) {fails})'!r}))
-one = WasmInstance(translated(code, 1 << 16), 1 << 16)
+one = WasmInstance(translate(code, 1 << 16), 1 << 16)
 faulthandler.enable()
 for number in range(5):
     try:

@@ -96,7 +96,7 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "a round leaves the ROS master as it is": (Reconciler, "_compare", _at_once),
     "a node that comes back is placed nowhere": (RelayControl, "_state_node", _nothing),
     "every call is allowed": (CallGate, "decide", _allowed),
-    "a decision is not recorded": (Execution, "_recorded", _unrecorded),
+    "a decision is not recorded": (Execution, "_record", _unrecorded),
     "a strict answer does not wait for its record": (AuditTrail, "durable", _at_once),
     "a reload is answered before the relay has carried it out": (RelayControl, "carried_out", _at_once),
     "a call that began under the old policy is not decided again": (
@@ -115,11 +115,11 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
 
 
 PAIR_MUTANTS: dict[str, tuple[Any, str, Any]] = {
-    "an answer does not wait for the standby": (Replication, "stored", _at_once),
-    "every change counts as acknowledged by the standby": (ReplicationSender, "acknowledged", _at_once),
+    "an answer does not wait for the standby": (Replication, "until_stored", _at_once),
+    "every change counts as acknowledged by the standby": (ReplicationSender, "until_acknowledged", _at_once),
     "the standby acknowledges what it does not store": (Replica, "_execute", _nothing),
     "data of an earlier active appliance is accepted": (PassiveControl, "_accepts", lambda *_given: True),
-    "an appliance serves longer than its lease": (LeaseWatch, "_left", lambda _watch: 1000.0),
+    "an appliance serves longer than its lease": (LeaseWatch, "_seconds_left", lambda _watch: 1000.0),
     "an ended lease ends nothing": (LeaseWatch, "ended", lambda _watch: None),
     "a lapsed lease stops nothing": (LeaseWatch, "lapsed", lambda _watch: None),
     "a promise not to claim is not kept": (

@@ -17,8 +17,8 @@ from tests.support.translators import TRANSLATORS, guest_behind, load
 from tests.system.network.test_isolation import serving, source_seen
 
 COMMAND = (
-    "import sys; from appliance.cli.lazy import loaded; from appliance.cli.main import all_verbs; "
-    "sys.argv[0] = 'rosrv'; loaded(all_verbs()['protect'], 'protect')()"
+    "import sys; from appliance.cli.lazy import load_command; from appliance.cli.main import all_verbs; "
+    "sys.argv[0] = 'rosrv'; load_command(all_verbs()['protect'], 'protect')()"
 )
 FEW = "40000-40099"  # a small range, for a quick scan
 INSIDE, KEPT, OUTSIDE = 40007, 40022, 39000

@@ -165,7 +165,7 @@ def test_each_program_that_dates_data_dates_it_by_the_latest() -> None:
         str(path.relative_to(ROOT)): path.read_text() for path in files if "AgeClock(" in path.read_text()
     }
     assert len(users) == 4
-    right = (".dated", ".latest()", "EndTable(")
+    right = (".true_date", ".latest()", "EndTable(")
     assert [name for name, text in users.items() if not any(way in text for way in right)] == []
 
 

@@ -133,7 +133,7 @@ class Kernel:
             (NftBackend, "install", lambda _backend, rules: self._set(rules)),
             (NftBackend, "counters", lambda _backend: tuple(map(self._counter, self.rules))),
             (Namespace, "run", lambda _namespace, work: work()),
-            (close_ports, "applied", lambda: self.protection),
+            (close_ports, "applied_rules", lambda: self.protection),
             (isolation, "run_nft", lambda _namespace, text: setattr(self, "protection", text)),
             (isolation, "forget_tracked", lambda _namespace, _ports: self.forgotten.append(self.rules)),
             (isolation, "listening_ports", set),

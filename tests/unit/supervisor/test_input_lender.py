@@ -20,7 +20,7 @@ import sys
 from pathlib import Path
 from appliance.base.input_files import read_given_text
 from appliance.specifications.specification_files import read_folder
-print(read_given_text(Path(sys.argv[1])), read_folder(Path(sys.argv[2])).named())
+print(read_given_text(Path(sys.argv[1])), read_folder(Path(sys.argv[2])).by_name())
 """
 
 _TLS = """

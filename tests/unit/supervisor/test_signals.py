@@ -24,10 +24,10 @@ _HELD = """
 arrived = []
 for number in ENDING:
     signal.signal(number, lambda found, _frame: arrived.append(found))
-with signals.held():
+with signals.hold():
     send()
     assert arrived == []
-    with signals.heard():
+    with signals.hear():
         assert sorted(arrived) == sorted(ENDING)
     send()
 assert len(arrived) == len(ENDING)
@@ -46,7 +46,7 @@ def work():
 thread = threading.Thread(target=work)
 thread.start()
 assert blocked.wait(30)
-with signals.held():
+with signals.hold():
     send()  # would end this process
     assert set(ENDING) <= signal.sigpending()
 done.set()

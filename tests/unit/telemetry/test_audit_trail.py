@@ -174,4 +174,4 @@ def test_only_the_trail_makes_records_with_a_decision() -> None:
     assert {name for name in made if not name.startswith("audit/log/")} == {"telemetry/audit_trail.py"}
     own = inspect.getsource(AuditTrail)
     assert own.count("self.audit.record(") == 1, "every record passes the one method that counts it"
-    assert "self.meter.recorded(record)\n        return self.audit.record(record)" in own
+    assert "self.meter.count_record(record)\n        return self.audit.record(record)" in own

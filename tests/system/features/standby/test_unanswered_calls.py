@@ -9,12 +9,12 @@ from tests.support.waiting import eventually
 
 _CHANGES = {
     "control/process.py": (
-        "        watched = listener_limits.answering.watched(calls)\n",
+        "        watched = listener_limits.answering.watch(calls)\n",
         "        async def hanging(request):\n"
         "            while (control.settings.state / 'control' / 'hang').exists():\n"
         "                await asyncio.sleep(0.1)\n"
         "            return await calls(request)\n"
-        "        watched = listener_limits.answering.watched(hanging)\n",
+        "        watched = listener_limits.answering.watch(hanging)\n",
     )
 }
 
