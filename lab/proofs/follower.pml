@@ -78,7 +78,7 @@ bool fresh;             /* whether an answer came in this tick */
 #define WANTED (valid > 0 -> newest : NOBODY)
 #define IS_NAME (writing == 1 || writing == 2)
 
-/* = appliance/features/standby/witness/follower.py WitnessFollower._left */
+/* = appliance/features/standby/witness/follower.py WitnessFollower._seconds_left */
 #ifdef MUTANT_NOT_ABANDONED
 #define ABANDON false
 #else

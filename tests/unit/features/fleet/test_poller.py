@@ -33,7 +33,7 @@ class Site:
         self.offered: list[tuple[str, str]] = []
         self.reported: list[RobotReport] = []
         bundles, connection = idle(VerifiedBundles), idle(CollectorConnection)
-        vars(bundles).update(selected=self._select, get=self._get)
+        vars(bundles).update(fetch_selected=self._select, get=self._get)
         vars(connection).update(put=self._put)
         self.poller = Poller(
             bundles, connection, (PATH.site, PATH.group), 60.0, lambda: self.stated, self._offer, lambda: TIME
