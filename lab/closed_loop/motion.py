@@ -373,7 +373,7 @@ class SeparationWorld(DrivenWorld):
         speed = math.hypot(*self.base.velocity)
         delay = self.reaction + 0.02
         stops = speed * delay + speed**2 / (2 * self.braking) + self.speed * (delay + speed / self.braking)
-        return self.gap((*[self.persons[0].x, self.persons[0].y] * 2,), PERSON_RADIUS) - stops - 0.01  # type: ignore[arg-type]
+        return self.gap((*[self.persons[0].x, self.persons[0].y] * 2,), PERSON_RADIUS) - stops - 0.01  # type: ignore[arg-type]  # four of them
 
     def receive(self, at: int, topic: str, data: bytes) -> None:
         if self.case == "slowing" and travels(self.force[1]):

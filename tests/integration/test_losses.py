@@ -295,7 +295,7 @@ def viewed(site: Site) -> None:
             while json.loads(client.recv(20))["op"] != "publish":
                 pass
 
-    site.robot.host.run(view)  # type: ignore[attr-defined]
+    site.robot.host.run(view)  # type: ignore[attr-defined]  # a host of the lab
 
 
 def revoked(site: Site) -> None:
@@ -369,7 +369,7 @@ def half_open(site: Site) -> None:
         for client in clients:
             client.close()
 
-    site.guest.host.run(open_all)  # type: ignore[attr-defined]
+    site.guest.host.run(open_all)  # type: ignore[attr-defined]  # a host of the lab
 
 
 def hanging(role: str) -> Callable[[Site], None]:
@@ -415,7 +415,7 @@ def _calls(site: Site, *calls: tuple[str, ...]) -> None:
             for method, *parameters in calls:
                 getattr(master, method)("/filler", *parameters, f"http://{GUEST}:4000/")
 
-    site.guest.host.run(call)  # type: ignore[attr-defined]
+    site.guest.host.run(call)  # type: ignore[attr-defined]  # a host of the lab
 
 
 def names_filled(site: Site) -> None:
