@@ -232,7 +232,7 @@ def differences(before: Any, after: Any, at: str = "") -> Iterator[str]:
             f"{at} / {what}: {before[what]} → {number}"
             for what, number in after.items()
             if number - before[what]
-            >= 4  # less is of the moment, as a connection that is kept for the next call
+            >= 6  # less is of the moment, as connections that roscpp keeps for its next calls
         )
     elif isinstance(before, dict) and isinstance(after, dict):
         for key in sorted({*before, *after}):
