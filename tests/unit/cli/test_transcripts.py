@@ -97,7 +97,7 @@ def test_times_for_people_are_in_the_machines_zone(
     monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
     time.tzset()
     try:
-        played = section.played(transcript)
+        played = transcript.play(section.text)
     finally:
         monkeypatch.undo()
         time.tzset()
