@@ -243,3 +243,23 @@ def test_records_that_do_not_come_are_not_taken_for_none(
     reader.page.unroute(refused)
     expect(page.locator(".banner")).to_have_count(0)
     appliance.rosrv("host", "unblock", "10.0.0.77")
+
+
+def test_the_end_of_a_right_is_not_a_denied_call(
+    appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    called = "/parted", "/parting", "std_msgs/String", "http://127.0.0.1:1/"
+    assert attempt("registerPublisher", *called)[0] == 1
+    page = opened().go("now")
+    refused = page.get_by_role("region", name="Recently denied")
+    rest = appliance.rest()
+    current = rest.get("/v1/policy")
+    closed = current.json["text"].replace("/guarded =", "/parting = 10.9.9.9\n/guarded =")
+    loaded = rest.post("/v1/policy", closed, match=current.etag)
+    assert (loaded.status, loaded.json["revoked"]) == (200, 1), loaded.body
+    attempt("registerPublisher", "/parted", "/guarded", *called[2:])
+    for _ in ("live", "from the log"):
+        expect(refused.get_by_role("listitem").first).to_contain_text("/guarded")
+        expect(refused).not_to_contain_text("/parting")
+        page.reload()
+    assert rest.post("/v1/policy", current.json["text"], match=loaded.etag).status == 200

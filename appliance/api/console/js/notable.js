@@ -34,7 +34,7 @@ export async function startNotable() {
   const past = (/** @type {Record<string, any>} */ query) =>
     get("/v1/audit", { since: NEAR, limit: 100, equality: 1, ...query }).then(compared);
   const all = () => Promise.all([
-    past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
+    past({ decision: ["deny", "would deny"] }).then((records) => records.filter(isDeniedCall)), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
   ]).catch((error) => {
     if (mine === generation) notable.update({ missing: String(error.message) });
     return null;
@@ -66,10 +66,15 @@ function stands(/** @type {import("./events.js").Standing} */ { state, reason })
 function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
   if (event !== "record") return;
   const change = /** @type {any} */ ({ latest: record });
-  if (isDenial(record)) change.denials = added(notable.get().denials, record);
+  if (isDeniedCall(record)) change.denials = added(notable.get().denials, record);
   if (isDoing(record)) change.doings = added(notable.get().doings, record);
   if (record.severity === "alarm") change.incidents = added(notable.get().incidents, record);
   notable.update(change);
+}
+
+/** Whether a host was denied a call: the end of its right is not one, as in `rosrv audit summary`. @param {AuditRecord} record */
+function isDeniedCall(record) {
+  return isDenial(record) && (record.detail?.of ?? record.event) !== "revoked";
 }
 
 /** Whether a record is an action of a monitor, and not an operator's change of a monitor. @param {AuditRecord} record */
