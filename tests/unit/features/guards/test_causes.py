@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from appliance.api.routes.contract import EXAMPLES
 from appliance.base import clock
 from appliance.channel.messages import MonitorEvent, MonitorsReported
 from appliance.features.guards.presets import PRESETS, Guard, text_of
@@ -583,6 +584,16 @@ def begun(robot: Robot) -> None:
 def stopped_by_operator(robot: Robot) -> None:
     monitors_of(robot).stop("/cmd_vel")
     robot.wait(0.2)
+
+
+def test_the_example_of_rest_has_a_cause_of_its_preset() -> None:
+    [guard] = EXAMPLES["GuardList"]["guards"]
+
+    def in_general(cause: str) -> str:
+        return re.sub(r"\d+\.\d+", "…", re.sub(r"/\w+ of [0-9.]+", "NODE", cause))
+
+    causes = {in_general(cause) for _values, _script, cause in CASES[guard["preset"]]}
+    assert in_general(guard["last_stop"]["cause"]) in causes
 
 
 UNREAD = "no readable message from {} on {} since the guard began again"
