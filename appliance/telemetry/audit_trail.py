@@ -107,8 +107,11 @@ class Meter:
             asked = f"{category} {(record.resource or '')[:_LONGEST_RESOURCE]}".rstrip()
             self.denied_requests.add(f"{record.host or _NO_ADDRESS}\n{asked}", number)
 
-    def most_denied(self) -> str:
-        """Return in words which host was denied most in the last minute, and what; "" if none was."""
+    def most_denied(self, in_words: Callable[[str], str] = str) -> str:
+        """Return in words which host was denied most in the last minute, and what; "" if none was.
+
+        `in_words` returns an address with its name.
+        """
         hosts, requests = Counter[str](), dict[str, Counter[str]]()
         for name, number in self.denied_requests.counts().items():
             host, _, asked = name.partition("\n")
@@ -117,7 +120,7 @@ class Meter:
         for host, number in hosts.most_common(1):
             ((asked, _times),) = requests[host].most_common(1)
             more = " and more" if len(requests[host]) > 1 else ""
-            return f"{host} was denied {asked}{more}, {counted(number, 'time')}"
+            return f"{in_words(host)} was denied {asked}{more}, {counted(number, 'time')}"
         return ""
 
     def count_call(self, call: str, seconds: float) -> None:

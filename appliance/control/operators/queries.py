@@ -359,7 +359,9 @@ class Queries:
             starting=now() - self.began < _START_SECONDS,
             new_state=self.new_state(),
             last_minute=MinuteState(
-                sum(meter.denied.counts().values()), meter.dropped.counts(), most_denied=meter.most_denied()
+                sum(meter.denied.counts().values()),
+                meter.dropped.counts(),
+                most_denied=meter.most_denied(self.policies.in_words),
             ),
             **states_in(states, "status"),
         )

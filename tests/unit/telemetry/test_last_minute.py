@@ -42,6 +42,12 @@ def test_a_right_that_ended_does_not_count_as_a_denied_request() -> None:
     assert (meter.decisions["publish", "deny"], meter.denied_hosts.counts()) == (1, {"10.0.0.5": 1})
 
 
+def test_the_most_denied_host_has_its_name() -> None:
+    meter = Meter()
+    meter.count_record(_record("decision", "deny"))
+    assert meter.most_denied(lambda host: f"robot ({host})").startswith("robot (10.0.0.5) was denied publish")
+
+
 def _record(event: str, word: str) -> AuditRecord:
     return AuditRecord(
         id="1",
