@@ -162,7 +162,7 @@ def _grid(body: Status, host_in_words: HostInWords) -> Table:
     if doubted is not None:
         grid.add_row("clock", Text(doubted, style=_YELLOW))
     for name, text in _others_rules(body.firewall):
-        grid.add_row(name, text)
+        grid.add_row(name, Text(text))
     grid.add_row("policy", _policy(body.policy))
     monitors = body.monitors
     loaded = counted(monitors.loaded, "monitor")
@@ -244,16 +244,11 @@ def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
-    translating, dropping = firewall.translations or [], firewall.obstacles or []
-    words = []
-    if translating:
-        words.append(
-            f"{counted(len(translating), 'chain')} translating addresses, none towards the appliance"
-        )
-    if dropping:
-        words.append(f"{counted(len(dropping), 'obstacle')} to connections")
-    if words:
-        yield "others' rules", f"{'; '.join(words)}: --json"
+    if chains := firewall.translations:
+        text = f"{counted(len(chains), 'chain')} translating addresses, none towards the appliance: --json"
+        yield "others' rules", text
+    for obstacle in shorten(firewall.obstacles or [], _MAX_TROUBLES):
+        yield "obstacle", obstacle
 
 
 def _isolation(body: Status) -> str:
