@@ -85,8 +85,8 @@ _Isolation = Annotated[
 _Relayed = Annotated[
     str | None,
     typer.Option(
-        help="Topics and services that go through the relay: all, or monitored (those in [Monitor] of the policy or in"
-        " a specification; this is not a boundary)"
+        help="Topics and services that go through the relay: all, or monitored (those that a specification, [Monitor],"
+        " [Limits], [Authority] or ask names; this is not a boundary)"
     ),
 ]
 _Mediation = Annotated[

@@ -418,7 +418,8 @@ class Settings:
     )
     relaying: Literal["all", "monitored"] = key(
         default="all",
-        description="topics and services that go through the relay; `monitored` (those in [Monitor]) is not a boundary",
+        description="topics and services that go through the relay; `monitored` (those that a specification, [Monitor],"
+        " [Limits], [Authority] or `ask` names) is not a boundary",
     )
     mediation: Annotated[Literal["full", "monitored"], AfterValidator(_mediation_fits)] = key(
         default="full",

@@ -254,7 +254,7 @@ class Status(msgspec.Struct, frozen=True):
     master: Annotated[str, doc("URI for the nodes' ROS_MASTER_URI")]
     processes: Annotated[list[ProcessInfo], doc("of the appliance, the supervisor first")]
     isolation: Annotated[str, doc("netns, container or none")]
-    relaying: Annotated[str, doc("`all`, or `monitored`: only topics and services with monitors are relayed")]
+    relaying: Annotated[str, doc("`all`, or `monitored`: only those that a monitor or the policy names")]
     mediation: Annotated[str, doc("`full`, or `monitored`: nodes then get each other's own addresses")]
     firewall: FirewallState
     probe: Annotated[str, doc("probe of the ROS master: `passed`, or the finding, or empty if not run yet")]
