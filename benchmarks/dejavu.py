@@ -31,7 +31,7 @@ _FIELDS = ("key", "value")
 def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence[str], formula: str) -> str:
     """Return a specification. `events` has the names of each event's values, `over` the parameters."""
     lines = [
-        f"event {event}({', '.join(f'std::string {one}' for one in values if one in over)}) /{event} "
+        f"event {event}({', '.join(f'std::string {value}' for value in values if value in over)}) /{event} "
         f"diagnostic_msgs/KeyValue "
         f"'{{{', '.join(f'{_FIELDS[values.index(one)]}:{one}' for one in values if one in over)}}}' {{ }}"
         for event, values in events.items()

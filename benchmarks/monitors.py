@@ -218,8 +218,8 @@ def show(results: Results, mode: str, sizes: tuple[int, ...], names: list[str]) 
 def cell(results: Results, mode: str, size: int, name: str) -> str:
     runs, base = results[mode, size, name], results[mode, size, "C relay"]
 
-    def value(one: Result) -> float:
-        return one.p50 if mode == "paced" else one.rate
+    def value(result: Result) -> float:
+        return result.p50 if mode == "paced" else result.rate
 
     ratio = statistics.median(
         value(one) / value(other) if value(other) else float("nan")

@@ -76,8 +76,8 @@ class Statuses:
         self.said: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
         self._threads = [
-            threading.Thread(target=self._ask, args=(name, one.state))
-            for name, one in site.appliances.items()
+            threading.Thread(target=self._ask, args=(name, appliance.state))
+            for name, appliance in site.appliances.items()
         ]
         for thread in self._threads:
             thread.start()
@@ -97,7 +97,7 @@ class Statuses:
 
 
 def _judgement(state: StandbyState) -> str:
-    return f"{state.role}: {'; '.join(one.kind for one in standby_troubles(state)) or 'OK'}"
+    return f"{state.role}: {'; '.join(trouble.kind for trouble in standby_troubles(state)) or 'OK'}"
 
 
 def answered_by_two(events: list[dict[str, object]], grants: int) -> int:

@@ -259,8 +259,8 @@ def table(
             runs = results[mode, size, name]
             base = results[mode, size, "topic_tools"]
 
-            def value(one: Result) -> float:
-                return one.p50 if mode == "paced" else one.rate
+            def value(result: Result) -> float:
+                return result.p50 if mode == "paced" else result.rate
 
             ratio = statistics.median(
                 value(one) / value(other) if value(other) else float("nan")

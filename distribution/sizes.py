@@ -52,8 +52,8 @@ if __name__ == "__main__":
     rows = [
         ("", columns),
         *(
-            (name, [f"{one[key]:,}" for key in columns])
-            for name, one in sizes(*(sys.argv[1:] or ["HEAD"])).items()
+            (name, [f"{size[key]:,}" for key in columns])
+            for name, size in sizes(*(sys.argv[1:] or ["HEAD"])).items()
         ),
     ]
     sys.stdout.writelines(f"{name:24}" + "".join(f"{cell:>11}" for cell in row) + "\n" for name, row in rows)

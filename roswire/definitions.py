@@ -57,13 +57,13 @@ class Definitions:
         messages: dict[str, MessageDefinition] = {}
         services: dict[str, ServiceDefinition] = {}
         for file, text in files.items():
-            found = _FILE.match(file)
-            if found is None or found[2] not in (None, found[4]):
+            match = _FILE.match(file)
+            if match is None or match[2] not in (None, match[4]):
                 raise DefinitionError("write pkg/T.msg, pkg/msg/T.msg, pkg/T.srv or pkg/srv/T.srv", file)
-            name = f"{found[1]}/{found[3]}"
-            if name in (services if found[4] == "srv" else messages):
+            name = f"{match[1]}/{match[3]}"
+            if name in (services if match[4] == "srv" else messages):
                 raise DefinitionError(f"{name} is defined in two files", file)
-            if found[4] == "srv":
+            if match[4] == "srv":
                 services[name] = parse_service(name, text, file)
             else:
                 messages[name] = parse_message(name, text, file)

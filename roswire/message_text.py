@@ -154,8 +154,8 @@ def _field(code: str, package: str, source: str, line: int) -> Field:
     if len(words) != 2:
         raise DefinitionError(f"{code[:80]!a} is not a field; write 'type name'", source, line)
     notation, name = words
-    found = _TYPE.match(notation)
-    if found is None:
+    match = _TYPE.match(notation)
+    if match is None:
         raise DefinitionError(f"{notation[:80]!a} is not a type; write type, type[] or type[3]", source, line)
     if _FIELD_NAME.match(name) is None:
         raise DefinitionError(
@@ -163,7 +163,7 @@ def _field(code: str, package: str, source: str, line: int) -> Field:
             source,
             line,
         )
-    type_name, array, length = found.groups()
+    type_name, array, length = match.groups()
     if type_name == "Header":
         type_name = "std_msgs/Header"
     elif "/" not in type_name and type_name not in BUILTINS:

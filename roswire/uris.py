@@ -56,20 +56,20 @@ def service_uri(host: str, port: int) -> str:
 def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
     if len(text) > MAX_URI_LENGTH:
         raise InvalidUriError(f"{what} URI of {len(text)} characters; at most {MAX_URI_LENGTH} are allowed")
-    found = _URI.match(text)
-    if found is None:
+    match = _URI.match(text)
+    if match is None:
         raise InvalidUriError(f"{what} URI {quote(text)} {_complaint(text)}; write {form}")
-    if found["scheme"].lower() != scheme:
+    if match["scheme"].lower() != scheme:
         raise InvalidUriError(
-            f"{what} URI {quote(text)} has the scheme {quote(found['scheme'])}; write {form}"
+            f"{what} URI {quote(text)} has the scheme {quote(match['scheme'])}; write {form}"
         )
-    if found["port"] is None:
+    if match["port"] is None:
         raise InvalidUriError(f"{what} URI {quote(text)} has no port; write {form}")
-    port = int(found["port"][1:])
+    port = int(match["port"][1:])
     if not 1 <= port <= 65535:
         raise InvalidUriError(f"{what} URI {quote(text)} has port {port}; a port is between 1 and 65535")
     return NodeUri(
-        scheme, _host(found["host"], text, what), port, found["path"] or ("/" if scheme == "http" else "")
+        scheme, _host(match["host"], text, what), port, match["path"] or ("/" if scheme == "http" else "")
     )
 
 

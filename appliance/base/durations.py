@@ -7,8 +7,8 @@ _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
 
 
 def seconds_of(text: str) -> float | None:
-    found = _DURATION.fullmatch(text)
-    return None if found is None else float(found[1]) * _UNITS[found[2]]
+    match = _DURATION.fullmatch(text)
+    return None if match is None else float(match[1]) * _UNITS[match[2]]
 
 
 def bounded_seconds(text: str, shortest: str, longest: str) -> float:

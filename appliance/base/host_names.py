@@ -36,7 +36,7 @@ def addresses_of(names: Iterable[str], start: Starter = subprocess.Popen) -> dic
     """
     wanted = dict.fromkeys(names)
     listed = _read_names()
-    found = {name: listed.get(name.lower(), []) for name in wanted}
+    addresses = {name: listed.get(name.lower(), []) for name in wanted}
     until = clock.now() + _WHOLE_SECONDS
 
     def ask(name: str) -> list[str]:
@@ -54,11 +54,11 @@ def addresses_of(names: Iterable[str], start: Starter = subprocess.Popen) -> dic
         return []
 
     own = socket.gethostname().partition(".")[0].lower()
-    others = [name for name in wanted if not found[name]]
+    others = [name for name in wanted if not addresses[name]]
     others.sort(key=lambda name: name.lower().partition(".")[0] != own)
     with ThreadPoolExecutor(_AT_ONCE, "resolver") as threads:
-        found.update(zip(others, threads.map(ask, others[:_MAX_ASKED]), strict=False))
-    return found
+        addresses.update(zip(others, threads.map(ask, others[:_MAX_ASKED]), strict=False))
+    return addresses
 
 
 def _read_names() -> dict[str, list[str]]:

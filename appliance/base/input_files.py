@@ -82,10 +82,10 @@ def files_below(folder: Path) -> list[Path]:
 
     Raises `OSError` for a folder that may not be read, which `Path.glob` takes for empty.
     """
-    found: list[Path] = []
+    paths: list[Path] = []
     for path, is_folder in entries_of(folder):
-        found += files_below(path) if is_folder else [path]
-    return sorted(found)
+        paths += files_below(path) if is_folder else [path]
+    return sorted(paths)
 
 
 def entries_of(folder: Path) -> list[tuple[Path, bool]]:

@@ -32,12 +32,12 @@ def parse_timestamp(text: str, now: int, zone: tzinfo | None = UTC) -> int:
 
 
 def _date(text: str, now: int, zone: tzinfo | None) -> str:
-    found = re.fullmatch(
+    match = re.fullmatch(
         r"(?:(today|yesterday)(?:[ T](?=.)|$))?(?:(\d\d:\d\d(?::\d\d)?)(Z|[+-]\d\d:\d\d)?)?", text, re.ASCII
     )
-    if not text or found is None:
+    if not text or match is None:
         return text
-    day, time, offset = found.groups()
+    day, time, offset = match.groups()
     named = zone if offset is None else datetime.fromisoformat(f"2000-01-01T00:00{offset}").tzinfo
     moment = datetime.fromtimestamp(now // _SECOND, UTC).astimezone(named)
     later = day is None and time > moment.strftime("%H:%M:%S")

@@ -113,10 +113,10 @@ def body_refusal(text: str, choices: Collection[str] = ()) -> str:
     """Return the message for msgspec's `ValidationError` without its path; `choices` are those of an enumeration."""
     no_choice = text.removeprefix("Invalid enum value ")
     if no_choice != text:
-        return f"must be one of {', '.join(repr(str(one)) for one in choices)}, not {_cut(no_choice)}"
+        return f"must be one of {', '.join(repr(str(choice)) for choice in choices)}, not {_cut(no_choice)}"
     for pattern, said in _BODY.items():
-        if (found := re.fullmatch(pattern, text)) is not None:
-            return said(*found.groups())
+        if (match := re.fullmatch(pattern, text)) is not None:
+            return said(*match.groups())
     return text
 
 
@@ -137,10 +137,10 @@ def shape_of(pattern: str) -> str:
     """Return what a string must be that matches a pattern, in words where they are known."""
     if (digits := _HEX.fullmatch(pattern)) is not None:
         return f"{digits[1]} hexadecimal digits (0-9, a-f)"
-    found = _NAME.fullmatch(pattern)
-    if found is None:
+    match = _NAME.fullmatch(pattern)
+    if match is None:
         return f"a string that matches {pattern}"
-    first, rest, most, last, suffix = found.groups()
+    first, rest, most, last, suffix = match.groups()
     begin = " or ".join(word.removesuffix("s") for word in _characters(first))
     ends = " and ends" if last else ""
     longest = int(most) + 1 + bool(last)

@@ -80,7 +80,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     found += [(f"ipsec:{name}".removesuffix(":"), "hosts", line) for name, line in tunnels]
     found += _blocks(status.blocks)
     for view, state in states_of(status):
-        found += [(one.kind, one.about, one.text) for one in view.alarms(state)]
+        found += [(alarm.kind, alarm.about, alarm.text) for alarm in view.alarms(state)]
     alarms = (_alarm(kind, about, text) for kind, about, text in found)
     return sorted(_handle(status, alarms), key=lambda alarm: _ORDER.index(alarm.severity))
 
@@ -92,7 +92,7 @@ def _alarm(kind: str, about: About, text: str) -> Alarm:
 def activity(status: Status) -> list[Alarm]:
     """Return notices of the last minute's denials and drops, which are not faults of the appliance."""
     recent = status.last_minute
-    found = [
+    alarms = [
         _alarm(
             f"drops:{name}",
             "monitors",
@@ -104,8 +104,8 @@ def activity(status: Status) -> list[Alarm]:
     if recent.denials >= recent.attention_at:
         most = f" ({recent.most_denied})" if recent.most_denied else ""
         text = f"{counted(recent.denials, 'denial')} in the last minute{most}; rosrv audit summary --since 1m"
-        found.insert(0, _alarm("denials", "audit", text))
-    return list(_handle(status, found))
+        alarms.insert(0, _alarm("denials", "audit", text))
+    return list(_handle(status, alarms))
 
 
 def _handle(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:

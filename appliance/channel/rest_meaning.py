@@ -176,10 +176,10 @@ def _tag(operation: Operation, if_match: str) -> str | None:
     given = if_match.strip()
     if given == "*":
         return None
-    found = _TAG.fullmatch(given)
+    match = _TAG.fullmatch(given)
     numbered = plain(operation.fields()["expected"].type) is int
-    if found is None or (numbered and not _REVISION.fullmatch(found[1])):
+    if match is None or (numbered and not _REVISION.fullmatch(match[1])):
         raise BadTagError(
             f'{if_match[:80]!r} is not an ETag of {operation.of.where}: send the one that GET returns, as in "7"'
         )
-    return found[1]
+    return match[1]

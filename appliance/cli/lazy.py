@@ -97,12 +97,12 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: b
         @functools.cached_property
         def all_commands(self) -> dict[str, TyperCommand | TyperGroup]:
             own, table = self.own_commands, merge(verbs, *further())
-            found = {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
+            commands = {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
             if not panels:
-                return found
-            for name, command in found.items():
+                return commands
+            for name, command in commands.items():
                 command.rich_help_panel = panel_of(name)
-            return {name: found[name] for name in in_order(found)}
+            return {name: commands[name] for name in in_order(commands)}
 
         def get_params(self, ctx: "Context") -> "list[Parameter]":
             return _without_type_of_flags(super().get_params(ctx))

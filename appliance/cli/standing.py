@@ -143,13 +143,13 @@ def _ask(appliance: Appliance, request: AdminRequest[A]) -> A:
     return answer.unwrap()
 
 
-def _graph_of(found: Graph) -> MasterGraph:
-    ends = [(PUBLICATION, topic.name, one.node) for topic in found.topics for one in topic.publishers]
-    ends += [(SUBSCRIPTION, topic.name, name) for topic in found.topics for name in topic.subscribers]
-    return MasterGraph(frozenset(ends), {topic.name: topic.type for topic in found.topics})
+def _graph_of(graph: Graph) -> MasterGraph:
+    ends = [(PUBLICATION, topic.name, one.node) for topic in graph.topics for one in topic.publishers]
+    ends += [(SUBSCRIPTION, topic.name, name) for topic in graph.topics for name in topic.subscribers]
+    return MasterGraph(frozenset(ends), {topic.name: topic.type for topic in graph.topics})
 
 
-def _robot_nodes(found: Graph, policy: PolicyInForce) -> frozenset[str]:
+def _robot_nodes(graph: Graph, policy: PolicyInForce) -> frozenset[str]:
     """Return the nodes of the robot's machine: those of the hosts that the policy calls `robot`.
 
     Without one, as beside an appliance in a container, all nodes count.
@@ -160,8 +160,8 @@ def _robot_nodes(found: Graph, policy: PolicyInForce) -> frozenset[str]:
         address = ip_address(host)
         return address.is_loopback or any(address in network for network in networks)
 
-    here = frozenset(node.name for node in found.nodes if is_robot(node.host))
-    return here or frozenset(node.name for node in found.nodes)
+    here = frozenset(node.name for node in graph.nodes if is_robot(node.host))
+    return here or frozenset(node.name for node in graph.nodes)
 
 
 def _nodes_here(graph: MasterGraph) -> frozenset[str]:

@@ -109,8 +109,8 @@ def contents_of(files: Mapping[str, bytes]) -> BundleContents:
     texts = {name: _text(name, data) for name, data in files.items()}
     if len(texts[HOSTS]) > _LONGEST_HOSTS:
         raise BundleArchiveError(f"{HOSTS} is longer than {_LONGEST_HOSTS} characters")
-    named = {name: found[1] for name in texts if (found := _SPECIFICATION.fullmatch(name))}
-    defined = {name: found[1] for name in texts if (found := _DEFINITION.fullmatch(name))}
+    named = {name: match[1] for name in texts if (match := _SPECIFICATION.fullmatch(name))}
+    defined = {name: match[1] for name in texts if (match := _DEFINITION.fullmatch(name))}
     return BundleContents(
         policy=texts[POLICY],
         hosts=texts[HOSTS],

@@ -229,9 +229,9 @@ class Verifier:
     """The verification of a bundle: its faults (`findings`), and the claims that it does not prove (`notes`)."""
 
     def __init__(
-        self, place: Path, key: Path | None, folder: Path, copies: dict[tuple[str, int], list[dict[str, Any]]]
+        self, path: Path, key: Path | None, folder: Path, copies: dict[tuple[str, int], list[dict[str, Any]]]
     ) -> None:
-        self.names, self.open, self.foreign = open_bundle(place)
+        self.names, self.open, self.foreign = open_bundle(path)
         self.key, self.copies = folder / "key", copies
         self.raw_key = self.read_key(key)
         self.findings: list[str] = []

@@ -144,16 +144,16 @@ def next_segment(log: Path, after: int) -> int | None:
 
 
 def _header(connection: sqlite3.Connection, number: int) -> SegmentHeader | None:
-    found = select_signed(connection, "number IN (?, ?) ORDER BY number", number - 1, number)
-    if not found or found[-1].number != number:
+    checkpoints = select_signed(connection, "number IN (?, ?) ORDER BY number", number - 1, number)
+    if not checkpoints or checkpoints[-1].number != number:
         return None
-    if len(found) == 2 or number == 1:
-        return SegmentHeader(begin=found[0] if len(found) == 2 else None, end=found[-1])
+    if len(checkpoints) == 2 or number == 1:
+        return SegmentHeader(begin=checkpoints[0] if len(checkpoints) == 2 else None, end=checkpoints[-1])
     removed = last_removal(connection)
     if removed is None or removed.last_checkpoint != number - 1:
         return None
     after = RecordPlace(sequence=removed.last_sequence, hash=removed.last_hash)
-    return SegmentHeader(begin=None, after=after, end=found[-1])
+    return SegmentHeader(begin=None, after=after, end=checkpoints[-1])
 
 
 def _line(columns: StoredColumns, previous: bytes, digest: bytes, end: SignedCheckpoint) -> bytes:

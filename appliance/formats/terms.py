@@ -41,10 +41,10 @@ class BundlePath(NamedTuple):
     @classmethod
     def parse(cls, text: str) -> Self:
         """Return the path that a text names. Raises `TermsError`."""
-        found = _PATH.fullmatch(text)
-        if found is None:
+        match = _PATH.fullmatch(text)
+        if match is None:
             raise TermsError(f"{text[:200]!r} is not SITE/GROUP/VERSION.tar")
-        return cls(found[1], found[2], int(found[3]))
+        return cls(match[1], match[2], int(match[3]))
 
 
 def role_of(site: str, group: str) -> str:

@@ -228,12 +228,12 @@ def applied_rules() -> str:
 
 
 def _service(text: str) -> OpenService:
-    found = _SERVICE.fullmatch(text)
+    match = _SERVICE.fullmatch(text)
     try:
-        if found is None:
+        if match is None:
             raise ValueError("write tcp/22, udp/123 or tcp/8000-8010")
-        protocol: Literal["tcp", "udp"] = "tcp" if found[1] == "tcp" else "udp"
-        return OpenService(protocol, PortRange(int(found[2]), int(found[3] or found[2])))
+        protocol: Literal["tcp", "udp"] = "tcp" if match[1] == "tcp" else "udp"
+        return OpenService(protocol, PortRange(int(match[2]), int(match[3] or match[2])))
     except ValueError as error:
         raise ValueError(f"--open {text!r} is not a service: {error}") from None
 

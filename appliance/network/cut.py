@@ -186,9 +186,9 @@ def _of_nodes(
     owners = owners_of(one.inode for one in (*connections, *listeners))
     ports = {listener.port: owners[listener.inode].pid for listener in listeners if listener.inode in owners}
 
-    def pid(one: TcpSocket) -> int:
-        owner = owners.get(one.inode)
-        return ports.get(one.port, 0) if owner is None else owner.pid
+    def pid(tcp_socket: TcpSocket) -> int:
+        owner = owners.get(tcp_socket.inode)
+        return ports.get(tcp_socket.port, 0) if owner is None else owner.pid
 
     found = {pid(connection) for connection in connections}.intersection(ports.values())
     nodes = {one for one in found if is_node(NodeSockets(one, frozenset(), ""), known)}
@@ -273,19 +273,19 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
-def _destroy(diag: socket.socket, one: TcpSocket, number: int) -> bool:
+def _destroy(diag: socket.socket, tcp_socket: TcpSocket, number: int) -> bool:
     """Destroy a connection; return whether it still existed.
 
     For a connection that has ended the kernel finds the listener of its port, and would destroy that. So the cookie of
     the connection itself comes first.
     """
-    answer, _ = _diagnose(diag, _SOCK_DIAG_BY_FAMILY, one, number, _NO_COOKIE)
+    answer, _ = _diagnose(diag, _SOCK_DIAG_BY_FAMILY, tcp_socket, number, _NO_COOKIE)
     if answer is None:
         return False
     state, cookie = _FOUND.unpack_from(answer)
     if state in _ENDED_STATES:
         return False
-    _, code = _diagnose(diag, _SOCK_DESTROY, one, number, cookie)
+    _, code = _diagnose(diag, _SOCK_DESTROY, tcp_socket, number, cookie)
     return not code
 
 

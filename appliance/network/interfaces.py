@@ -224,12 +224,12 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
     def read(route: Netlink) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
         names = _names(route)
-        found = [
+        entries = [
             entry
             for entry in route.get_routes(family=family, table=_MAIN_TABLE)
             if not entry["dst_len"] and entry["type"] == _UNICAST
         ]
-        for entry in sorted(found, key=lambda entry: entry.get_attr("RTA_PRIORITY") or 0):
+        for entry in sorted(entries, key=lambda entry: entry.get_attr("RTA_PRIORITY") or 0):
             hops = entry.get_attr("RTA_MULTIPATH") or []
             hop = hops[0] if hops else entry
             index = hop["oif"] if hops else entry.get_attr("RTA_OIF")

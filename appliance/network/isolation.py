@@ -277,26 +277,26 @@ class Isolation:
     def obstacles(self) -> tuple[str, ...]:
         """Return what keeps connections from their end on this machine, with a remedy for each."""
         link = self.settings.link
-        found = [
+        obstacles = [
             f"{chain} drops forwarded packets by default: let interface {link} pass in it, both ways"
             for chain in (*self._backend.foreign_forward_drops(), *iptables.foreign_forward_drops(self._host))
         ]
-        found += [
+        obstacles += [
             f"packets from {source} have routing table {table}, but the appliance's answers do not: `ip rule add iif"
             f" {link} lookup {table}`, and `advertise` {source} to the networks behind it"
             for source, table in interfaces.tables_of_sources(self._host, link)
         ]
         if taken := self._listening_ports((*self.settings.ports, *self._tcp)):
             holder = self._host.run(lambda: describe_holder(taken))
-            found.append(f"{holder}, which leads to the appliance: give it another port")
+            obstacles.append(f"{holder}, which leads to the appliance: give it another port")
         no_router = {_no_router(family): _GLOBAL[family].replace("/", ".") for family in self.ends}
-        found += [
+        obstacles += [
             f"{rule.purpose}, and drops packets: if containers, virtual machines or a hotspot send them, write"
             f" `{no_router[rule.purpose]} = 1` into /etc/sysctl.d, and boot again"
             for rule in self.rules()
             if rule.purpose in no_router and rule.packets
         ]
-        return tuple(found)
+        return tuple(obstacles)
 
     def forward_again(self) -> tuple[Family, ...]:
         """Enable the forwarding that another program has ended; return its families. Raises `NetworkError`."""
@@ -321,7 +321,7 @@ class Isolation:
 
     def require_free(self, ports: Iterable[int]) -> None:
         """Raise `NetworkError` if a program of the host listens on a port that is not forwarded."""
-        used = self._host.run(listening_ports) & ({*ports} - {one.first for one in self._tcp})
+        used = self._host.run(listening_ports) & ({*ports} - {port_range.first for port_range in self._tcp})
         if used:
             raise NetworkError(
                 f"a program of the host listens on TCP {', '.join(map(str, sorted(used)))}: stop it, or choose"

@@ -62,8 +62,8 @@ def require_network_admin(what: str) -> None:
 
 def _has_capabilities(wanted: int) -> bool:
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-    found = re.search(r"^CapEff:\t([0-9a-f]{1,32}+)", status, re.MULTILINE)
-    return found is not None and int(found[1], 16) & wanted == wanted
+    match = re.search(r"^CapEff:\t([0-9a-f]{1,32}+)", status, re.MULTILINE)
+    return match is not None and int(match[1], 16) & wanted == wanted
 
 
 def require_privileges(what: str) -> None:
@@ -192,18 +192,18 @@ class Namespace:
 
     def processes(self) -> list[int]:
         """Return the other processes in the namespace."""
-        found: list[int] = []
+        processes: list[int] = []
         try:
             mark = self._handle.stat()
         except OSError:
-            return found
+            return processes
         for entry in Path("/proc").iterdir():
             if entry.name.isdecimal() and int(entry.name) != os.getpid():
                 with contextlib.suppress(OSError):
                     seen = (entry / "ns/net").stat()
                     if (seen.st_dev, seen.st_ino) == (mark.st_dev, mark.st_ino):
-                        found.append(int(entry.name))
-        return sorted(found)
+                        processes.append(int(entry.name))
+        return sorted(processes)
 
     def open(self) -> int:
         """Return a descriptor of the namespace, which the caller closes."""

@@ -33,17 +33,17 @@ def node_sockets(namespace: Namespace, ports: Iterable[int], master_port: int) -
     wanted = set(ports)
     relevant = [one for one in namespace.run(tcp_sockets) if one.listens or _calls(one, master_port)]
     owners = {inode: owner.pid for inode, owner in owners_of(one.inode for one in relevant).items()}
-    found: dict[int, NodeSockets] = {}
+    sockets: dict[int, NodeSockets] = {}
     for one in relevant:
         pid = owners.get(one.inode)
         if pid is None:
             continue
-        so_far = found.get(pid, NodeSockets(pid, frozenset(), ""))
+        so_far = sockets.get(pid, NodeSockets(pid, frozenset(), ""))
         if one.listens:
-            found[pid] = so_far._replace(listening=so_far.listening | {one.port})
+            sockets[pid] = so_far._replace(listening=so_far.listening | {one.port})
         else:
-            found[pid] = so_far._replace(master_address=one.local_address)
-    return {port: one for one in found.values() for port in sorted(one.listening & wanted)}
+            sockets[pid] = so_far._replace(master_address=one.local_address)
+    return {port: socket for socket in sockets.values() for port in sorted(socket.listening & wanted)}
 
 
 def is_node(process: NodeSockets, known: Collection[str] = ()) -> bool:
@@ -99,25 +99,25 @@ def user_of(pid: int) -> str:
 
 def programs_of_unit(unit: str) -> list[str]:
     """Return the command lines of the processes of a unit of the system's own slice."""
-    found = []
+    programs = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():
             with suppress(OSError):
                 groups = (entry / "cgroup").read_text(encoding="utf-8", errors="replace")
                 if any(line.endswith(f":/system.slice/{unit}") for line in groups.splitlines()):
-                    found.append(
+                    programs.append(
                         (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode("utf-8", "replace")
                     )
-    return found
+    return programs
 
 
-def _calls(one: TcpSocket, master_port: int) -> bool:
-    return one.established and one.peer_port == master_port
+def _calls(socket: TcpSocket, master_port: int) -> bool:
+    return socket.established and socket.peer_port == master_port
 
 
 def owners_of(inodes: Iterable[str]) -> dict[str, SocketOwner]:
     """Return, for each socket, one process that has it open."""
-    found: dict[str, SocketOwner] = {}
+    owners: dict[str, SocketOwner] = {}
     wanted = {f"socket:[{inode}]": inode for inode in inodes}
     for entry in Path("/proc").iterdir() if wanted else ():
         if not entry.name.isdecimal():
@@ -127,5 +127,5 @@ def owners_of(inodes: Iterable[str]) -> dict[str, SocketOwner]:
                 with suppress(OSError):
                     inode = wanted.get(str(descriptor.readlink()))
                     if inode is not None:
-                        found.setdefault(inode, SocketOwner(int(entry.name), int(descriptor.name)))
-    return found
+                        owners.setdefault(inode, SocketOwner(int(entry.name), int(descriptor.name)))
+    return owners

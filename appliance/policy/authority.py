@@ -144,17 +144,17 @@ def read_authority(
     return found
 
 
-def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings: Findings) -> None:
+def _define(entry: Entry, file: str, groups: dict[str, AuthorityGroup], findings: Findings) -> None:
     word = entry.key
     if not _NAME.fullmatch(word.text) or word.text in _OPTIONS:
         text = f"{quote(word.text)} is not the name of a group: letters, digits and _ . - after a letter"
         findings.error(word, text)
         return
-    if len(found) >= _MAX:
+    if len(groups) >= _MAX:
         findings.error(word, f"more than {_MAX} groups")
         return
     names: set[str] = set()
-    taken = {name: group.name for group in found.values() for name in group.names}
+    taken = {name: group.name for group in groups.values() for name in group.names}
     for value in entry.values:
         if not is_global_name(value.text):
             text = f"{quote(value.text)}: a group lists full names such as /cmd_vel, without patterns"
@@ -164,7 +164,7 @@ def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings:
         names.add(value.text)
     if not names:
         findings.error(word, "name the topics and services of the group, such as /cmd_vel")
-    found[word.text] = AuthorityGroup(
+    groups[word.text] = AuthorityGroup(
         word.text, frozenset(names), Rule(AUTHORITY, word.text, file, word.line)
     )
 

@@ -207,24 +207,24 @@ class HoursTable:
         if len(unit) > 1 and unit[0].text in LIMITING:
             self._findings.error(unit[0], f"name the host before {unit[0].text}")
             return None
-        found: dict[str, Word] = {}
+        words: dict[str, Word] = {}
         for place in range(1, len(unit), 2):
             word = unit[place]
             if place + 1 == len(unit):
                 example = "a date such as 2026-12-05" if word.text == UNTIL else "a name of [Hours]"
                 self._findings.error(word, f"{word.text} needs {example} after it")
                 return None
-            if word.text in found:
+            if word.text in words:
                 self._findings.error(word, f"{word.text} is already given for {unit[0].text}")
                 return None
-            found[word.text] = unit[place + 1]
-        until = self._until(found[UNTIL]) if UNTIL in found else None
-        hours = self._named(found[DURING]) if DURING in found else None
-        if not found or (UNTIL in found and until is None) or (DURING in found and hours is None):
+            words[word.text] = unit[place + 1]
+        until = self._until(words[UNTIL]) if UNTIL in words else None
+        hours = self._named(words[DURING]) if DURING in words else None
+        if not words or (UNTIL in words and until is None) or (DURING in words and hours is None):
             return None
         text = " ".join(word.text for word in unit)
         about = [] if hours is None else [f"{DURING} {hours.text}"]
-        limit = " ".join([*about, f"{UNTIL} {found[UNTIL].text}"] if UNTIL in found else about)
+        limit = " ".join([*about, f"{UNTIL} {words[UNTIL].text}"] if UNTIL in words else about)
         if until is not None and self._now is not None and until <= self._now:
             self._findings.warn(unit[0], f"{text} has ended: it grants nothing, remove it")
         return RightTime(text, limit, unit[0].line, math.inf if until is None else until, hours)

@@ -68,8 +68,8 @@ class Key:
         return all(map(_compatible, self.steps, other.steps))
 
 
-def _compatible(one: Step, other: Step) -> bool:
-    (text, star), (other_text, other_star) = one, other
+def _compatible(step: Step, other: Step) -> bool:
+    (text, star), (other_text, other_star) = step, other
     fits = star and other_text.startswith(text)
     return fits or (other_star and text.startswith(other_text)) or text == other_text
 

@@ -374,13 +374,13 @@ class Policy:
         reason = f"{decision.reason}, while it moves and no higher rank of {group.name} does: {line}"
         return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
 
-    def _decide_named_only(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
-        if found is None:
+    def _decide_named_only(self, request: Request, table: RuleTable, rule: CompiledRule | None) -> Decision:
+        if rule is None:
             reason = (
                 f"{self._what(request, 'may not')}: only its own key in [Commands] grants it, never default"
             )
             return Decision(False, None, reason)
-        decision = self._apply(request, table, found)
+        decision = self._apply(request, table, rule)
         # audit-only is for learning the needs of a robot. No robot needs these calls, so they stay denied.
         return replace(decision, allowed=False, would_deny=False) if decision.would_deny else decision
 

@@ -82,11 +82,11 @@ def compile_policy(
     )
 
 
-def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionText]:
+def _by_name(texts: list[SectionText], findings: Findings) -> dict[str, SectionText]:
     by_fold = {name.casefold(): name for name in sections.NAMES}
-    there = {section.name.text.casefold() for section in found}
+    there = {section.name.text.casefold() for section in texts}
     by_name: dict[str, SectionText] = {}
-    for section in found:
+    for section in texts:
         place = section.name
         name = by_fold.get(place.text.casefold())
         if name is None:

@@ -45,9 +45,9 @@ def read_ports(section: SectionText | None, findings: Findings) -> range:
 
 def _range(entry: Entry, findings: Findings) -> range | None:
     word = entry.values[0] if entry.values else entry.key
-    found = _RANGE.fullmatch("".join(value.text for value in entry.values))
-    first, last = (int(found[1]), int(found[2])) if found else (0, 0)
-    if not found:
+    match = _RANGE.fullmatch("".join(value.text for value in entry.values))
+    first, last = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not match:
         findings.error(word, "expected range = FIRST-LAST, such as 19001-20000")
     elif not 1024 <= first < last <= 65535:
         text = f"{first}-{last}: the range must be ascending, within 1024 to 65535, two ports for each node"

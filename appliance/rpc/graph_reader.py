@@ -193,7 +193,7 @@ class _Survey:
                 asked[place] = f"port {place.port}" if host in here else host
         own_first = dict(sorted(asked.items(), key=lambda row: not row[1].startswith("port ")))
         left = max(0.0, self._limits.whole - (clock.now() - self._began))
-        found = await serve_by_host(
+        results = await serve_by_host(
             own_first, lambda place: self._node(place, counts),
             HostShare(min(left, _HOST_SHARE * self._limits.whole), left, self._limits.at_once),
         )  # fmt: skip
@@ -203,8 +203,8 @@ class _Survey:
             if place is None or not host:
                 nodes.append(node)
                 continue
-            late += place not in found
-            said = found.get(place, _Asked())
+            late += place not in results
+            said = results.get(place, _Asked())
             nodes.append(SurveyedNode(node.name, node.uri, host, said.pid, said.problem, said.connections))
         if late:
             self._left_out.append(
@@ -222,14 +222,14 @@ class _Survey:
         try:
             async with self._turns:
                 uri = _text(await self._ask(master, "lookupNode", name))
-            place = parse_node_uri(uri)
+            node_uri = parse_node_uri(uri)
         except (CallFailedError, InvalidUriError) as error:
             return SurveyedNode(name, uri, problem=str(error)), None
-        return SurveyedNode(name, uri, problem=f"{place.host} is not known on this machine"), place
+        return SurveyedNode(name, uri, problem=f"{node_uri.host} is not known on this machine"), node_uri
 
-    async def _node(self, place: NodeUri, counts: list[dict[str, tuple[float, int]]]) -> _Asked:
+    async def _node(self, uri: NodeUri, counts: list[dict[str, tuple[float, int]]]) -> _Asked:
         client = XmlRpcClient(
-            replace(place, host=self._addresses[place.host]), timeout=self._limits.call, limits=_LIMITS
+            replace(uri, host=self._addresses[uri.host]), timeout=self._limits.call, limits=_LIMITS
         )
         try:
             pid = await self._ask(client, "getPid")
@@ -291,8 +291,8 @@ class _Survey:
 
         pairs = itertools.product(sorted({master, *hosts} - {""}), LISTENERS)
         seconds = 2 * _PORT_SECONDS
-        found = await serve_by_host({row: row[0] for row in pairs}, one, HostShare(seconds, seconds))
-        return tuple(dict.fromkeys([own, *filter(None, found.values())]))
+        results = await serve_by_host({row: row[0] for row in pairs}, one, HostShare(seconds, seconds))
+        return tuple(dict.fromkeys([own, *filter(None, results.values())]))
 
 
 def is_here(address: str) -> bool:

@@ -35,7 +35,7 @@ async def serve_by_host(
     hosts: dict[str, deque[Member]] = {}
     for member, host in members.items():
         hosts.setdefault(host, deque()).append(member)
-    found: dict[Member, Result] = {}
+    results: dict[Member, Result] = {}
     of_host = min(share.host_at_once, max(1, share.at_once // max(1, len(hosts))))
     turns = asyncio.Semaphore(share.at_once)
 
@@ -46,7 +46,7 @@ async def serve_by_host(
                     time.reschedule(asyncio.get_running_loop().time() + share.host)
                 if waiting:
                     member = waiting.popleft()
-                    found[member] = await work(member)
+                    results[member] = await work(member)
 
     async def serve_host(waiting: deque[Member]) -> None:
         with suppress(TimeoutError):
@@ -56,4 +56,4 @@ async def serve_by_host(
     with suppress(TimeoutError):
         async with asyncio.timeout(share.whole):
             await asyncio.gather(*map(serve_host, hosts.values()))
-    return found
+    return results

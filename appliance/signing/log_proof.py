@@ -119,9 +119,9 @@ def parse_checkpoint(text: bytes) -> Checkpoint:
     if match is not None:
         log, number, sequence, digest, time, previous, last = match.groups()
         removed = None if last is None else int(last)
-        found = Checkpoint(log, int(number), int(sequence), digest, int(time), previous, removed)
-        if found.text() == text:
-            return found
+        checkpoint = Checkpoint(log, int(number), int(sequence), digest, int(time), previous, removed)
+        if checkpoint.text() == text:
+            return checkpoint
     raise ValueError("not the text of an audit checkpoint")
 
 

@@ -77,10 +77,10 @@ def proof_of(token: str, challenge: str, stated: bytes) -> str:
 
 def parse_proof(header: str) -> tuple[str, bytes]:
     """Return the challenge and the signature. Raises `BadProofError`."""
-    found = _PROOF_FORM.fullmatch(header)
-    if found is None:
+    match = _PROOF_FORM.fullmatch(header)
+    if match is None:
         raise BadProofError(f"{HEADER} is not `CHALLENGE SIGNATURE`")
-    return found[1], base64.urlsafe_b64decode(found[2] + "==")
+    return match[1], base64.urlsafe_b64decode(match[2] + "==")
 
 
 def is_signed(verifying: bytes, stated: bytes, signature: bytes) -> bool:

@@ -130,10 +130,10 @@ def sync_index(folder: Path) -> None:
         write_whole(folder / INDEX, msgspec.json.encode(index), 0o600)
 
 
-def acknowledge(folder: Path, found: RememberedLog, time: int, by: int) -> None:
+def acknowledge(folder: Path, remembered_log: RememberedLog, time: int, by: int) -> None:
     """Write that an operator set the log aside, as it is in the memory now. Raises `OSError`."""
-    content = msgspec.json.encode(Acknowledgement(found.first, found.last, time, by))
-    write_whole(folder / f"{found.log}.acknowledged", content, 0o600)
+    content = msgspec.json.encode(Acknowledgement(remembered_log.first, remembered_log.last, time, by))
+    write_whole(folder / f"{remembered_log.log}.acknowledged", content, 0o600)
 
 
 def others(logs: list[RememberedLog], present: str) -> list[OtherLog]:

@@ -112,9 +112,9 @@ def _public(line: str) -> bytes:
 
 
 def _read(signature: str) -> tuple[bytes, bytes, bytes, bytes]:
-    found = _ARMOUR.fullmatch(signature.replace("\r\n", "\n"))
+    match = _ARMOUR.fullmatch(signature.replace("\r\n", "\n"))
     try:
-        blob = base64.b64decode(found[1].replace("\n", ""), validate=True) if found else b""
+        blob = base64.b64decode(match[1].replace("\n", ""), validate=True) if match else b""
     except binascii.Error as error:
         raise ValueError("not base64") from error
     if blob[:10] != _MAGIC + (1).to_bytes(4):
@@ -141,13 +141,13 @@ def _wire(*strings: bytes) -> bytes:
 
 def _strings(data: bytes, count: int) -> list[bytes]:
     """Return the `count` strings; raise `ValueError` if there is another number."""
-    found = []
+    strings = []
     while data:
         length = int.from_bytes(data[:4])
         if len(data) < 4 + length:
             raise ValueError("cut off")
-        found.append(data[4 : 4 + length])
+        strings.append(data[4 : 4 + length])
         data = data[4 + length :]
-    if len(found) != count:
+    if len(strings) != count:
         raise ValueError("something else")
-    return found
+    return strings

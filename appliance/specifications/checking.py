@@ -107,7 +107,7 @@ def contents(
             )
             for monitor in monitors.monitors
         },
-        givens={name: found for name in monitors.names if (found := tuple(_givens(monitors, name)))},
+        givens={name: states for name in monitors.names if (states := tuple(_givens(monitors, name)))},
         switches={monitor.name: monitor.code.switch for monitor in monitors.monitors if monitor.code.switch},
     )
 

@@ -184,12 +184,12 @@ def _with_differences(coming: Coming, before: InForce) -> Coming:
     }
     given = {
         name: {
-            one.name: one.value
-            for one in new.givens.states(new.checked, name)
-            if one.name in old and one.value != old[one.name]
+            state.name: state.value
+            for state in new.givens.states(new.checked, name)
+            if state.name in old and state.value != old[state.name]
         }
         for name in new.checked.monitors
-        if (old := {one.name: one.value for one in before.givens.states(before.checked, name)})
+        if (old := {state.name: state.value for state in before.givens.states(before.checked, name)})
     }
     return coming._replace(put=put, given={name: values for name, values in given.items() if values})
 

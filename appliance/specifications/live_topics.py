@@ -45,7 +45,7 @@ def judge_topics(
     Monitors in `shadow` mode cut nothing; those that are `promoted` from it are judged again. With `forced`,
     conflicts are warnings.
     """
-    found = TopicFindings([], [])
+    findings = TopicFindings([], [])
     acting = [name for name in coming.monitors if name not in shadow]
     heard, known, read = (
         _heard(coming, coming.monitors),
@@ -62,13 +62,13 @@ def judge_topics(
             for node, theirs in published.get(topic, {}).items():
                 if difference := _difference(theirs, ours):
                     text = f"{node} publishes {topic} as {difference}: {consequence}"
-                    (found.conflicts if error else found.warnings).append(
+                    (findings.conflicts if error else findings.warnings).append(
                         f"{place}: {'error' if error else 'warning'}: {text}"
                     )
         if topic in heard - known and topic not in published:
             near = meant(topic, published)
-            found.warnings.append(f"{place}: warning: no node publishes {topic} now{near}")
-    return found
+            findings.warnings.append(f"{place}: warning: no node publishes {topic} now{near}")
+    return findings
 
 
 def judge_holds(
@@ -84,7 +84,7 @@ def judge_holds(
 
     Only monitors that are `acting` now and later hold topics. The files `moved` go to another relay.
     """
-    found = TopicFindings([], [])
+    findings = TopicFindings([], [])
     for name in (one for one in acting if one in present.states):
         owner = coming.states[name]
         changed = owner.identity != present.states[name].identity
@@ -94,10 +94,10 @@ def judge_holds(
             dropped = f"drops every message of {', '.join(topics)} until it is resumed"
             text = f"{name} loses its state, because {why}, and {dropped}"
             refused = not hold and any(live.moving for topic in topics for live in published[topic].values())
-            (found.conflicts if refused else found.warnings).append(
+            (findings.conflicts if refused else findings.warnings).append(
                 f"{owner.position}: {'error' if refused else 'warning'}: {text}; {_HOLD if refused else _RESUME} {name}"
             )
-    return found
+    return findings
 
 
 _RESUME = "when it is safe: rosrv monitor resume"

@@ -232,7 +232,7 @@ class Stops:
         if key not in self._allowances and len(self._allowances) >= _MAX:
             self._allowances = {one: each for one, each in self._allowances.items() if not each.full(now)}
         allowance = self._allowances.setdefault(key, _Allowance(STOPS, LONG_QUIET, STOPS, now))
-        found = StoppedTopic(
+        topic = StoppedTopic(
             *key,
             event.first or last,
             last,
@@ -244,9 +244,9 @@ class Stops:
             present=cause,
             ahead=ahead,
         )
-        self._going[key] = _Going(found, now, QUIET if allowance.take(now) else LONG_QUIET)
-        self.last[event.monitor] = found
-        return found
+        self._going[key] = _Going(topic, now, QUIET if allowance.take(now) else LONG_QUIET)
+        self.last[event.monitor] = topic
+        return topic
 
     def note_record(self, stop: StoppedTopic, record: str) -> None:
         going = self._going[stop.monitor, stop.topic]

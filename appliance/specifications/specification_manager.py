@@ -273,8 +273,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     def afresh(self, name: str) -> Word | None:
         """Return how a monitor would begin with a new state directory; None if its file is not in the folder."""
-        found = self._folder.looked_at()
-        text = found.files.get(self.checked.monitors[name]) if found is not None else None
+        sources = self._folder.looked_at()
+        text = sources.files.get(self.checked.monitors[name]) if sources is not None else None
         if text is None:
             return None
         word = file_switch(text)

@@ -337,11 +337,11 @@ class ContainerIsolation(NoIsolation):
 
     def endpoint(self) -> PublicAddress:
         """Return the only address; if there are several, it is unknown which of them other hosts reach."""
-        found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
+        address = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
-            reason = f"{found.reason}, in a container: outside the machine the address may differ"
-            return replace(found, reason=reason)
-        return found
+            reason = f"{address.reason}, in a container: outside the machine the address may differ"
+            return replace(address, reason=reason)
+        return address
 
     def watch_rules(self) -> list[RuleWatch]:
         return [RuleWatch(subscribe(self._namespace))]
@@ -362,10 +362,10 @@ class ContainerIsolation(NoIsolation):
         rules, before = appliance_rules(self._settings()), self._before
         listening, own = self._namespace.run(lambda: (listening_ports(), machine_addresses()))
 
-        def is_refused(one: TcpSocket) -> bool:
-            peer, accepted = one.peer_address, one.port in listening
-            near = peer in own or peer == one.local_address or ipaddress.ip_address(peer).is_loopback
-            return any(rule.refuses(one, accepted=accepted, near=near) for rule in rules)
+        def is_refused(socket: TcpSocket) -> bool:
+            peer, accepted = socket.peer_address, socket.port in listening
+            near = peer in own or peer == socket.local_address or ipaddress.ip_address(peer).is_loopback
+            return any(rule.refuses(socket, accepted=accepted, near=near) for rule in rules)
 
         return end_connections(self._namespace, lambda one: one.inode not in before and is_refused(one))
 

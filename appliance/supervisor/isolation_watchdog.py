@@ -99,9 +99,9 @@ class IsolationWatchdog:
         self._taking_machine = True
         try:
             async with self._one_at_a_time:
-                found = self.isolation.machine_addresses()
-                await in_thread(lambda: self.isolation.trust_machine((*self._machine, *found)))
-                self._machine = found
+                addresses = self.isolation.machine_addresses()
+                await in_thread(lambda: self.isolation.trust_machine((*self._machine, *addresses)))
+                self._machine = addresses
                 self._tell(self.machine())
                 self._told_machine_at = clock.now()
         except Exception as error:  # noqa: BLE001  see the invariant

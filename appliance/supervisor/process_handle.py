@@ -253,11 +253,11 @@ class ProcessHandle:
         self._reports.died(self, code)
 
 
-def link_processes(one: ProcessHandle, other: ProcessHandle) -> None:
+def link_processes(handle: ProcessHandle, other: ProcessHandle) -> None:
     here, there = socket.socketpair()
     with here, there:
-        one.send(LinkOpened(role=other.role, index=other.index), (here.fileno(),))
-        other.send(LinkOpened(role=one.role, index=one.index), (there.fileno(),))
+        handle.send(LinkOpened(role=other.role, index=other.index), (here.fileno(),))
+        other.send(LinkOpened(role=handle.role, index=handle.index), (there.fileno(),))
 
 
 def _environment(home: str) -> dict[str, str]:

@@ -176,8 +176,8 @@ class Show:
         """Return the denial of an attack: a new record of its resource, or the one whose reason the answer repeats."""
         before = self.last_sequence
 
-        def find(found: list[Record]) -> Record | None:
-            denials = [one for one in found if one["event"] != "denials folded"]
+        def find(records: list[Record]) -> Record | None:
+            denials = [record for record in records if record["event"] != "denials folded"]
             self.last_sequence = max((denial["sequence"] for denial in denials), default=before)
             matching = [
                 one

@@ -62,19 +62,19 @@ class Segment(NamedTuple):
                 yield time
 
 
-def segment(begin: float, one: State, end: float, other: State) -> Segment:
+def segment(begin: float, state: State, end: float, other: State) -> Segment:
     t = end - begin
-    p, d = one[0], other[0] - one[0]
+    p, d = state[0], other[0] - state[0]
     if t == 0:
         return Segment(
-            begin, 0.0, (p, *(each / (1 + power) for power, each in enumerate(one[1 : len(other)])))
+            begin, 0.0, (p, *(each / (1 + power) for power, each in enumerate(state[1 : len(other)])))
         )
-    if min(len(one), len(other)) == 1:
+    if min(len(state), len(other)) == 1:
         return Segment(begin, t, (p, d / t))
-    v, w = one[1] * t, other[1] * t
-    if min(len(one), len(other)) == 2:
+    v, w = state[1] * t, other[1] * t
+    if min(len(state), len(other)) == 2:
         return Segment(begin, t, (p, v / t, (3 * d - 2 * v - w) / t**2, (v + w - 2 * d) / t**3))
-    a, b = one[2] * t**2, other[2] * t**2
+    a, b = state[2] * t**2, other[2] * t**2
     return Segment(begin, t, (
         p, v / t, a / (2 * t**2),
         (20 * d - 12 * v - 8 * w - 3 * a + b) / (2 * t**3),
@@ -86,11 +86,11 @@ def segment(begin: float, one: State, end: float, other: State) -> Segment:
 def extremes(points: Sequence[Point], samples: int = 60) -> tuple[float, float]:
     """Return the greatest distance from zero and the greatest velocity of a joint between points, of samples."""
     far = fast = 0.0
-    for one, other in pairwise(points):
-        for joint in range(len(one.positions)):
-            way = segment(one.at, one.of(joint), other.at, other.of(joint))
+    for point, other in pairwise(points):
+        for joint in range(len(point.positions)):
+            way = segment(point.at, point.of(joint), other.at, other.of(joint))
             for sample in range(samples + 1):
-                p, v, _a = way.state(one.at + way.seconds * sample / samples)
+                p, v, _a = way.state(point.at + way.seconds * sample / samples)
                 far, fast = max(far, abs(p)), max(fast, abs(v))
     return far, fast
 
@@ -137,7 +137,7 @@ class Controller:
         left = [point for point in points if begin + point.at > now]
         if (
             not left
-            or any(one.at >= other.at for one, other in pairwise(points))
+            or any(point.at >= other.at for point, other in pairwise(points))
             or not names
             or not set(names) <= set(self.joints)
             or (len(names) > len(self.joints) if self.partial else len(names) != len(self.joints))

@@ -31,7 +31,7 @@ def apart(one: Segment, other: Segment) -> float:
 
 
 def edges(corners: Sequence[Point]) -> list[Segment]:
-    return [(*one, *other) for one, other in zip(corners, [*corners[1:], corners[0]], strict=True)]
+    return [(*corner, *other) for corner, other in zip(corners, [*corners[1:], corners[0]], strict=True)]
 
 
 def is_inside(corners: Sequence[Point], x: float, y: float) -> bool:

@@ -88,9 +88,9 @@ class RunningGuard:
 
     @staticmethod
     def _sent(outcome: Outcome) -> Iterator[tuple[int, str, bytes]]:
-        for one in outcome.sent_messages():
-            if not one.is_call:
-                yield (outcome.time - _ns(0)) // MS, one.topic, bytes(one.data)
+        for message in outcome.sent_messages():
+            if not message.is_call:
+                yield (outcome.time - _ns(0)) // MS, message.topic, bytes(message.data)
 
     @property
     def holds(self) -> bool:

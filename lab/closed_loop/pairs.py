@@ -82,7 +82,7 @@ def _text(preset: str, name: str, kind: str) -> str:
 
 def pair_factory(worlds: Mapping[str, type[World]]) -> Callable[..., World]:
     """Return a function that makes the world of a seed, with a guard of another preset beside its own."""
-    firsts = [one for one in worlds if one not in WITHOUT]
+    firsts = [world for world in worlds if world not in WITHOUT]
 
     def make(seed: int, change: Change, trace: Callable[[str], None] | None) -> World:
         r = random.Random(f"pair {seed}")  # noqa: S311  a seed gives the same world again

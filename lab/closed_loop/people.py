@@ -179,10 +179,10 @@ class EnableWorld(SwitchWorld):
             return law, "a device has not said a word"
         if quiet := self.quiet(slack):
             return law, f"the device of node {quiet[0]} is silent"
-        for node, one in self.switches.items():
-            if not one.on:
+        for node, switch in self.switches.items():
+            if not switch.on:
                 return law, f"the device of node {node} is let go"
-            if not one.was_off:
+            if not switch.was_off:
                 return "L6", f"the device of node {node} was never let go"
         return None
 
@@ -319,8 +319,8 @@ class ModeWorld(SwitchWorld):
             return law, "a node has not said the mode"
         if quiet := self.quiet(slack):
             return law, f"node {quiet[0]}, which says the mode, is silent"
-        for node, one in self.switches.items():
-            if one.on:
+        for node, switch in self.switches.items():
+            if switch.on:
                 return law, f"node {node} says manual"
         return None
 

@@ -76,16 +76,16 @@ def rows_of(summaries: Mapping[str, Summary], firsts: Mapping[str, int], commit:
         name: Row(
             digests[name],
             firsts[name],
-            one.worlds,
-            round(one.seconds),
-            round(one.clearance, 4) if one.clearance < float("inf") else None,
-            dict(one.violations),
+            summary.worlds,
+            round(summary.seconds),
+            round(summary.clearance, 4) if summary.clearance < float("inf") else None,
+            dict(summary.violations),
             date,
-            {commit: one.worlds},
-            dict(one.acts),
-            dict(one.honest),
+            {commit: summary.worlds},
+            dict(summary.acts),
+            dict(summary.honest),
         )
-        for name, one in summaries.items()
+        for name, summary in summaries.items()
     }
 
 

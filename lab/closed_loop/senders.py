@@ -252,7 +252,7 @@ def edge(w: "JointsWorld") -> None:
     """Preempt with a point at a limit, at any velocity there."""
     r = w.random
     sides = [math.copysign(w.most - r.choice((0, 0.02)), one or 1) for one in w.told]
-    t = max(abs(one - p) for one, p in zip(sides, w.told, strict=True)) / (0.9 * w.fastest) + r.choice(
+    t = max(abs(side - p) for side, p in zip(sides, w.told, strict=True)) / (0.9 * w.fastest) + r.choice(
         (0.0, 0.2)
     )
     v = tuple(r.choice((-1, 0, 1)) * w.fastest for _ in JOINTS)

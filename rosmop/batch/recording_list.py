@@ -28,9 +28,9 @@ def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingN
 
     A set is a folder (with its folders) or a pattern. Raises `RecordingError` for an empty set.
     """
-    found: dict[str, RecordingName] = {}
+    names: dict[str, RecordingName] = {}
     for file in files:
-        found.setdefault(os.path.realpath(file), local_recording(file))
+        names.setdefault(os.path.realpath(file), local_recording(file))
     for one in sets:
         if one.startswith("s3://"):
             raise RecordingError(
@@ -38,10 +38,10 @@ def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingN
             )
         paths = sorted(_paths(one))
         for path in paths:
-            found.setdefault(os.path.realpath(path), local_recording(Path(path)))
+            names.setdefault(os.path.realpath(path), local_recording(Path(path)))
         if not paths:
             raise RecordingError(f"there are no recordings ({', '.join(ENDINGS)}) in {one}")
-    return list(found.values())
+    return list(names.values())
 
 
 def _paths(one: str) -> Iterator[str]:

@@ -191,24 +191,24 @@ class ExpectedTopic:
         return before if isinstance(before, int) else (*before[:2], after[2])
 
     def _step(
-        self, one: PropertyStep, states: States, case: StepCase, frame: int, result: ExpectedResult
+        self, step: PropertyStep, states: States, case: StepCase, frame: int, result: ExpectedResult
     ) -> bool:
-        if one.number is None:
+        if step.number is None:
             raise LeftToEngineError
-        if isinstance(one.compiled, ClockedProperty):
-            run = ClockedRun(one.compiled, 0)
-            run.state, run.since, run.now = states[one.number]
-            categories = run.step(one.event, case.now)
-            states[one.number] = run.state, run.since, run.now
+        if isinstance(step.compiled, ClockedProperty):
+            run = ClockedRun(step.compiled, 0)
+            run.state, run.since, run.now = states[step.number]
+            categories = run.step(step.event, case.now)
+            states[step.number] = run.state, run.since, run.now
             deadline = run.deadline
             result.sooner |= deadline is not None and deadline < case.until
-            if any(handled.category in categories for handled in one.handlers):
+            if any(handled.category in categories for handled in step.handlers):
                 raise LeftToEngineError
             return False
-        assert isinstance(one.compiled, FiniteProperty)  # noqa: S101  a property with a number has tables
-        automaton = one.compiled.automaton
-        state = states[one.number] = automaton.table[states[one.number]][one.event]
-        run_now = [handled for handled in one.handlers if handled.category in automaton.verdicts[state]]
+        assert isinstance(step.compiled, FiniteProperty)  # noqa: S101  a property with a number has tables
+        automaton = step.compiled.automaton
+        state = states[step.number] = automaton.table[states[step.number]][step.event]
+        run_now = [handled for handled in step.handlers if handled.category in automaton.verdicts[state]]
         if any(each.verdict is None or not case.counted >> each.verdict & 1 for each in run_now):
             raise LeftToEngineError
         bits = 0
@@ -219,7 +219,7 @@ class ExpectedTopic:
                 raise LeftToEngineError
             result.verdicts.append(handled.verdict or 0)
         if bits & RESET:
-            states[one.number] = automaton.initial
+            states[step.number] = automaton.initial
         return bool(bits & DROPPED)
 
 
@@ -228,8 +228,8 @@ def _initial(property_: CompiledProperty) -> int:
     return property_.automaton.initial if isinstance(property_, FiniteProperty) else property_.initial
 
 
-def begun_in(one: PropertyStep, state: int) -> Any:
-    return state if isinstance(one.compiled, FiniteProperty) else (state, BEGAN, BEGAN)
+def begun_in(step: PropertyStep, state: int) -> Any:
+    return state if isinstance(step.compiled, FiniteProperty) else (state, BEGAN, BEGAN)
 
 
 def _drops(compiled: Compiled, function: str) -> bool:
@@ -324,29 +324,29 @@ def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
                 yield StepCase(happen | answers), number, True
 
 
-def _handling(one: PropertyStep) -> tuple[int, int] | None:
-    if one.number is None or not isinstance(one.compiled, FiniteProperty):
+def _handling(step: PropertyStep) -> tuple[int, int] | None:
+    if step.number is None or not isinstance(step.compiled, FiniteProperty):
         return None
-    handled, automaton = {handler.category for handler in one.handlers}, one.compiled.automaton
+    handled, automaton = {handler.category for handler in step.handlers}, step.compiled.automaton
     for state, targets in enumerate(automaton.table):
-        if not handled.isdisjoint(automaton.verdicts[targets[one.event]]):
-            return one.number, state
+        if not handled.isdisjoint(automaton.verdicts[targets[step.event]]):
+            return step.number, state
     return None
 
 
-def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
+def _answers(step: PropertyStep, bits: int) -> dict[int, int]:
     bits |= HAPPENED | CHANGED
     return {
         handler.function: bits if handler.drops else bits & ~DROPPED
-        for handler in one.handlers
+        for handler in step.handlers
         if handler.verdict is not None
     }
 
 
-def _times(one: PropertyStep) -> Sequence[int]:
-    if isinstance(one.compiled, FiniteProperty):
+def _times(step: PropertyStep) -> Sequence[int]:
+    if isinstance(step.compiled, FiniteProperty):
         return (BEGAN,)
-    within = one.compiled.within  # type: ignore[attr-defined]  # it has a clock
+    within = step.compiled.within  # type: ignore[attr-defined]  # it has a clock
     return BEGAN - 5, BEGAN, BEGAN + within, BEGAN + within + 1
 
 
@@ -378,32 +378,32 @@ class _Bench:
             self._sweep(case, one, first, min(first + self._most, states))
         return states
 
-    def _sweep(self, case: StepCase, one: PropertyStep | None, first: int, behind: int) -> None:
+    def _sweep(self, case: StepCase, step: PropertyStep | None, first: int, behind: int) -> None:
         begun = self._topic.initial_states()
         if case.beside is not None:
             begun[case.beside[0]] = case.beside[1]
-        if one is not None and self._topic.clocked:
-            begun[one.number or 0] = begun_in(one, first)
+        if step is not None and self._topic.clocked:
+            begun[step.number or 0] = begun_in(step, first)
         if any(self._waits_no_more(number, state, case) for number, state in begun.items()):
             return
         notes = self._out + RECORD.size * (behind - first)
         self._put_down(case, begun, notes)
-        cell = self._scratch if one is None else self._cells.base + 8 * (one.number or 0)
+        cell = self._scratch if step is None else self._cells.base + 8 * (step.number or 0)
         self._machine.refuel(_FUEL * (behind - first) * case.frames)
         end = self._frames + 20 * case.frames
         try:
             self._try(first, behind, cell, self._out, end, case.now)
         except WasmTrap as trap:
-            self._differs(case, one, first, f"it stopped: {trap}")
+            self._differs(case, step, first, f"it stopped: {trap}")
         expected = []
         at = notes
         for place, state in enumerate(range(first, behind)):
-            if one is not None and not self._topic.clocked:
-                begun[one.number or 0] = state
+            if step is not None and not self._topic.clocked:
+                begun[step.number or 0] = state
             expected.append(self._topic.walk(dict(begun), case))
             answer = *RECORD.unpack_from(self._memory, self._out + RECORD.size * place), at
-            at = self._compare(case, one, state, answer, expected[-1])
-        self._count(case, one, expected)
+            at = self._compare(case, step, state, answer, expected[-1])
+        self._count(case, step, expected)
 
     def _waits_no_more(self, number: int, state: Any, case: StepCase) -> bool:
         tables = self._topic.properties[number].compiled
@@ -436,7 +436,7 @@ class _Bench:
     def _compare(
         self,
         case: StepCase,
-        one: PropertyStep | None,
+        step: PropertyStep | None,
         state: int,
         given: tuple[int, ...],
         expected: ExpectedResult,
@@ -446,25 +446,25 @@ class _Bench:
         begins = [self._frames + 20 * frame for frame in range(4)]
         wanted = [(function, begins[frame] + 4, len(_FRAME)) for function, frame in expected.calls]
         effect = [(-1, begins[begin] | begins[behind] << 32) for begin, behind in expected.effects[:1]]
-        after: Any = None if one is None else expected.states[one.number or 0]
+        after: Any = None if step is None else expected.states[step.number or 0]
         number = after if after is None or isinstance(after, int) else after[0]
-        clock = self._clock(one) if one is not None and self._topic.clocked else ()
+        clock = self._clock(step) if step is not None and self._topic.clocked else ()
         for found, right, what_of in (
             (answer, expected.answer | begins[expected.position], "its result"),
             (notes, wanted, "the functions it calls, in order"),
             ([(who, what)] if effect else [], effect, "the messages it drops"),
-            (None if one is None else cell, number, "the next state"),
+            (None if step is None else cell, number, "the next state"),
             (clock, after[1:] if clock else (), "the clock"),
         ):
             if found != right:
-                self._differs(case, one, state, f"{what_of}: {found}, not {right}")
+                self._differs(case, step, state, f"{what_of}: {found}, not {right}")
         return int(end)
 
-    def _clock(self, one: PropertyStep) -> tuple[int, ...]:
-        address = self._cells.clocks.get(one.number or 0)
+    def _clock(self, step: PropertyStep) -> tuple[int, ...]:
+        address = self._cells.clocks.get(step.number or 0)
         return () if address is None else struct.unpack_from("<2q", self._memory, address)
 
-    def _count(self, case: StepCase, one: PropertyStep | None, expected: Sequence[ExpectedResult]) -> None:
+    def _count(self, case: StepCase, step: PropertyStep | None, expected: Sequence[ExpectedResult]) -> None:
         rows = [
             [0] * len(self._feed.functions),
             [0] * len(self._feed.functions),
@@ -477,7 +477,7 @@ class _Bench:
         wanted = tuple(count for row_of in rows for count in row_of)
         found = struct.unpack_from(f"<{len(wanted)}q", self._memory, self._feed.counters)
         if found != wanted:
-            self._differs(case, one, 0, f"its counters: {found}, not {wanted}")
+            self._differs(case, step, 0, f"its counters: {found}, not {wanted}")
 
     def _differs(self, case: StepCase, one: PropertyStep | None, state: int, text: str) -> None:
         formula = "" if one is None else f", `{one.compiled.logic}: {one.compiled.formula}` in state {state}"

@@ -85,9 +85,9 @@ class AbstractParts:
 
     def with_part(self, path: Path, value: AbstractValue) -> "AbstractParts":
         size = len(path)
-        parts = {known: one for known, one in self.parts.items() if known[:size] != path}
+        parts = {known: part for known, part in self.parts.items() if known[:size] != path}
         if isinstance(value.known, AbstractParts):
-            parts |= {(*path, *inner): one for inner, one in value.known.parts.items()}
+            parts |= {(*path, *inner): part for inner, part in value.known.parts.items()}
         else:
             parts[path] = value
         return AbstractParts(parts, self.others)
@@ -184,7 +184,7 @@ def key_of(value: AbstractValue | None) -> Hashable:
         return None
     known = value.known
     if isinstance(known, AbstractParts):
-        parts = frozenset((path, key_of(one)) for path, one in known.parts.items())
+        parts = frozenset((path, key_of(part)) for path, part in known.parts.items())
         return (parts, key_of(known.others), *value[1:])
     if isinstance(known, tuple):
         known = tuple(map(key_of, known))

@@ -56,9 +56,9 @@ def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes
 
 
 def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) -> None:
-    place = require_place(target, "an assignment")
+    lvalue = require_place(target, "an assignment")
     flag = mark(scope, target)
-    scope.evaluate(_store(scope, place, value))
+    scope.evaluate(_store(scope, lvalue, value))
     if flag is not None:
         scope.evaluate(nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True)))
 
@@ -83,30 +83,30 @@ def mark(scope: FunctionScope, target: Value) -> str | None:
     return variable.flag
 
 
-def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
-    if isinstance(place, VariableLvalue):
-        if place.variable.alias is not None:
-            return _store(scope, require_place(place.variable.alias, "an assignment"), value)
-        _note(scope, place)
-        return nodes.Assign(place.variable.type, place.variable.code, value)
-    if isinstance(place, ElementLvalue):
-        return nodes.Call(value.type, "a_put", (place.base.form, place.index, value), place.site)
-    if isinstance(place, FieldLvalue):
-        slot = nodes.Literal(value_types.INT, place.slot)
-        return nodes.Call(value.type, "a_slot", (place.base.form, slot, value))
-    return _store_part(scope, place, value)
+def _store(scope: FunctionScope, lvalue: Lvalue, value: nodes.Expression) -> nodes.Expression:
+    if isinstance(lvalue, VariableLvalue):
+        if lvalue.variable.alias is not None:
+            return _store(scope, require_place(lvalue.variable.alias, "an assignment"), value)
+        _note(scope, lvalue)
+        return nodes.Assign(lvalue.variable.type, lvalue.variable.code, value)
+    if isinstance(lvalue, ElementLvalue):
+        return nodes.Call(value.type, "a_put", (lvalue.base.form, lvalue.index, value), lvalue.site)
+    if isinstance(lvalue, FieldLvalue):
+        slot = nodes.Literal(value_types.INT, lvalue.slot)
+        return nodes.Call(value.type, "a_slot", (lvalue.base.form, slot, value))
+    return _store_part(scope, lvalue, value)
 
 
-def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
-    assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
-    inner, base = require_place(place.base, "an assignment"), place.base.form
-    if isinstance(place, TimePartLvalue):
-        part = nodes.Literal(value_types.VOID, place.part.encode())
-        return _store(scope, inner, nodes.Call(base.type, "a_part", (base, part, value), place.site))
-    changed = nodes.Call(base.type, "a_character", (base, place.index, value), place.site)
+def _store_part(scope: FunctionScope, lvalue: Lvalue, value: nodes.Expression) -> nodes.Expression:
+    assert isinstance(lvalue, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
+    inner, base = require_place(lvalue.base, "an assignment"), lvalue.base.form
+    if isinstance(lvalue, TimePartLvalue):
+        part = nodes.Literal(value_types.VOID, lvalue.part.encode())
+        return _store(scope, inner, nodes.Call(base.type, "a_part", (base, part, value), lvalue.site))
+    changed = nodes.Call(base.type, "a_character", (base, lvalue.index, value), lvalue.site)
     return _store(scope, inner, changed)
 
 
-def _note(scope: FunctionScope, place: VariableLvalue) -> None:
-    if place.variable.shared:
-        scope.effects.written.add(place.variable.code)
+def _note(scope: FunctionScope, lvalue: VariableLvalue) -> None:
+    if lvalue.variable.shared:
+        scope.effects.written.add(lvalue.variable.code)

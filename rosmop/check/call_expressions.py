@@ -205,9 +205,9 @@ def _check_referenced(value: Value, kind: value_types.Type, function: HelperFunc
         )
 
 
-def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
+def _check_apart(value: Value, other: Value, function: HelperFunction) -> None:
     """Reject references to overlapping values: one change would undo the other, or stay invisible."""
-    if all(step == beside for step, beside in zip(path(one), path(other), strict=False)):
+    if all(step == beside for step, beside in zip(path(value), path(other), strict=False)):
         raise SpecificationError.at(
             other.position,
             f"`{path(other)[0]}` is passed to two references of `{function.name}`,"

@@ -50,14 +50,14 @@ def first_facts(names: SpecificationNames) -> Iterator[nodes.Assign]:
 
 
 def note_facts(scope: FunctionScope, event: str) -> bool:
-    found = _variables(scope.names, event)
-    for variable in found:
+    variables = _variables(scope.names, event)
+    for variable in variables:
         scope.effects.written.add(variable.code)
         value = (
             _NOW if variable.type == value_types.LONG else nodes.SenderName(variable.name.partition("(")[0])
         )
         scope.evaluate(nodes.Assign(variable.type, variable.code, value))
-    return bool(found)
+    return bool(variables)
 
 
 def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Value:

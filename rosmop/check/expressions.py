@@ -100,10 +100,10 @@ def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
 
 
 def literal_number(scope: FunctionScope, node: tree.NumberLiteral) -> Value:
-    found = _NUMBER.match(node.text)
-    if found is None or len(node.text) > _MAX_DIGITS or found[1].count(".") > 1:
+    match = _NUMBER.match(node.text)
+    if match is None or len(node.text) > _MAX_DIGITS or match[1].count(".") > 1:
         raise SpecificationError.at(node.position, f"{quote(node.text)} is not a number")
-    text, suffix = found[1], found[2].lower()
+    text, suffix = match[1], match[2].lower()
     if not text.lower().startswith("0x") and re.search(r"[.eE]", text):
         return _floating(node, float(text), suffix)
     if "f" in suffix:
@@ -211,11 +211,11 @@ def read(variable: Variable, node: tree.SyntaxNode) -> Value:
     if variable.alias is not None:
         alias = variable.alias
         return Value(alias.form, node.position, VariableLvalue(variable), owned=False)
-    place = VariableLvalue(variable)
+    lvalue = VariableLvalue(variable)
     if variable.table is not None:
-        return Value(nodes.Literal(variable.type, variable.table), node.position, place, owned=False)
+        return Value(nodes.Literal(variable.type, variable.table), node.position, lvalue, owned=False)
     value = nodes.Read(variable.type, variable.code)
-    return Value(value, node.position, place, owned=False, constant=variable.known)
+    return Value(value, node.position, lvalue, owned=False, constant=variable.known)
 
 
 def _message(scope: FunctionScope, node: tree.Expression) -> Value:
@@ -256,8 +256,8 @@ def _step(scope: FunctionScope, node: tree.IncrementExpression) -> Value:
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
     first, target = ([], target) if target.pure else order.settle(scope, target)
-    one = constant_value(node.position, value_types.INT, 1)
-    operands = operators.Operands(scope, node.position, target, one, scope.site(node))
+    value = constant_value(node.position, value_types.INT, 1)
+    operands = operators.Operands(scope, node.position, target, value, scope.site(node))
     changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
     stored = assignments.store(scope, target, changed)
     before = nodes.Sequence(target.type, (target.form, stored), 0)
@@ -356,9 +356,9 @@ def _index(scope: FunctionScope, node: tree.IndexExpression) -> Value:
         return order.after(first, vector_members.element_value(base, index, node.position, site))
     if isinstance(base.type, value_types.StringType | value_types.CharactersType):
         at = convert(scope, index, value_types.LONG)
-        place = CharacterLvalue(base, at, site) if base.place is not None else None
+        lvalue = CharacterLvalue(base, at, site) if base.place is not None else None
         character = nodes.Call(value_types.CHAR, "e_character", (base.form, at), site)
-        return order.after(first, Value(character, node.position, place))
+        return order.after(first, Value(character, node.position, lvalue))
     raise SpecificationError.at(node.position, f"{base.type} has no elements")
 
 

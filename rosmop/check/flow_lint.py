@@ -164,13 +164,13 @@ class SpecificationFlow:
                 found |= bringing(code.property, graph, category)
         return found
 
-    def _inputs(self, one: PatternField) -> Iterator[str]:
-        for path, _ in self._leaves(one):
+    def _inputs(self, pattern_field: PatternField) -> Iterator[str]:
+        for path, _ in self._leaves(pattern_field):
             yield f"field {path}"
-        if isinstance(one.type, value_types.IntegerType):
-            yield f"whole {_path_of(one)}"
+        if isinstance(pattern_field.type, value_types.IntegerType):
+            yield f"whole {_path_of(pattern_field)}"
 
-    def _leaves(self, one: PatternField) -> list[tuple[str, Path]]:
+    def _leaves(self, pattern_field: PatternField) -> list[tuple[str, Path]]:
         """Return the floating-point numbers of a field: their names, and their paths in the value."""
         found: list[tuple[str, Path]] = []
 
@@ -183,7 +183,7 @@ class SpecificationFlow:
                 for slot_name, slot in self._messages.slots(kind.name).items():
                     walk(slot.type, f"{name}.{slot_name}", (*path, slot.index))
 
-        walk(one.type, _path_of(one), ())
+        walk(pattern_field.type, _path_of(pattern_field), ())
         return found[:_MAX_LEAVES]
 
     # NaN
@@ -221,19 +221,19 @@ class SpecificationFlow:
 
     def _reached_inputs(self) -> set[str]:
         """Return the inputs that come to a comparison, a bound or a conversion, perhaps by way of variables."""
-        found = {name for event in self.events for name in event.compared}
+        inputs = {name for event in self.events for name in event.compared}
         stored: dict[str, frozenset[str]] = {}
         for event in self.events:
             for state in event.exits.values():
                 for name, value in state.values.items():
                     if is_shared(name):
                         stored[name] = stored.get(name, frozenset()) | value.inputs
-        waiting = [*found]
+        waiting = [*inputs]
         while waiting:
-            more = stored.get(waiting.pop(), frozenset()) - found
-            found |= more
+            more = stored.get(waiting.pop(), frozenset()) - inputs
+            inputs |= more
             waiting += more
-        return found
+        return inputs
 
     def _passes(self, source: _Source, start: dict[str, AbstractValue]) -> Places:
         """Return the places where NaN skips what would restrict a message, and the message passes."""

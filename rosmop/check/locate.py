@@ -115,10 +115,10 @@ class FieldLocator:
     """Writes the statements that find fields to `found`; `inner` is for a skipped element."""
 
     def __init__(
-        self, symbols: Symbols, found: list[nodes.Statement], site: int, *, inner: bool = False
+        self, symbols: Symbols, statements: list[nodes.Statement], site: int, *, inner: bool = False
     ) -> None:
         self._symbols = symbols
-        self._found = found
+        self._found = statements
         self._site = site
         self._inner = inner
         self._skippers: dict[int, nodes.Skipper] = {}

@@ -146,9 +146,9 @@ def field(scope: FunctionScope, base: Value, name: str, position: Position, site
             if name in {constant.name for constant in scope.messages.definition(base.type.name).constants}:
                 return constant(scope, base.type.name, name, position)
             raise SpecificationError.at(position, str(error)) from None
-        place = FieldLvalue(base, slot.index) if base.place is not None else None
+        lvalue = FieldLvalue(base, slot.index) if base.place is not None else None
         item = nodes.Item(slot.type, base.form, slot.index)
-        return Value(item, position, place, owned=base.owned)
+        return Value(item, position, lvalue, owned=base.owned)
     if isinstance(base.type, value_types.TimeType | value_types.DurationType) and name in ("sec", "nsec"):
         kind = value_types.UINT if isinstance(base.type, value_types.TimeType) else value_types.INT
         part = TimePartLvalue(base, name, site) if base.place is not None else None

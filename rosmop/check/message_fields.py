@@ -106,8 +106,8 @@ def _offset(field: PatternField) -> int:
     return field.spot.offset if field.spot is not None else 0
 
 
-def _near(one: PatternField, other: PatternField) -> bool:
-    gap = _offset(other) - _offset(one) - struct_size(struct_code(one.type) or "")
+def _near(field: PatternField, other: PatternField) -> bool:
+    gap = _offset(other) - _offset(field) - struct_size(struct_code(field.type) or "")
     return 0 <= gap <= 256
 
 
@@ -144,8 +144,8 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
                 )
 
 
-def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
+def _overlap(binding: tree.Binding, other: tree.Binding) -> bool:
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
-        for step, beside in zip(one.path, other.path, strict=False)
+        for step, beside in zip(binding.path, other.path, strict=False)
     )

@@ -59,15 +59,15 @@ def settle(scope: FunctionScope, value: Value) -> tuple[First, Value]:
     return [*value.first, *first], replace(value, form=read, place=settled_place, first=())
 
 
-def _read(kind: Type, place: Lvalue) -> nodes.Expression:
-    if isinstance(place, ElementLvalue):
-        return nodes.Call(kind, "l_element", (place.base.form, place.index), place.site)
-    if isinstance(place, CharacterLvalue):
-        return nodes.Call(kind, "e_character", (place.base.form, place.index), place.site)
-    if isinstance(place, FieldLvalue):
-        return nodes.Item(kind, place.base.form, place.slot)
-    assert isinstance(place, TimePartLvalue)  # the last kind
-    return nodes.Call(kind, f"m_{place.part}", (place.base.form,))
+def _read(kind: Type, lvalue: Lvalue) -> nodes.Expression:
+    if isinstance(lvalue, ElementLvalue):
+        return nodes.Call(kind, "l_element", (lvalue.base.form, lvalue.index), lvalue.site)
+    if isinstance(lvalue, CharacterLvalue):
+        return nodes.Call(kind, "e_character", (lvalue.base.form, lvalue.index), lvalue.site)
+    if isinstance(lvalue, FieldLvalue):
+        return nodes.Item(kind, lvalue.base.form, lvalue.slot)
+    assert isinstance(lvalue, TimePartLvalue)  # the last kind
+    return nodes.Call(kind, f"m_{lvalue.part}", (lvalue.base.form,))
 
 
 def arguments(scope: FunctionScope, values: Sequence[Value]) -> tuple[First, list[Value]]:

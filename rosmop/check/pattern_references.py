@@ -48,22 +48,22 @@ def _refers(node: tree.Property) -> bool:
 class _Rewriting:
     def __init__(self, specification: tree.Specification, node: tree.Property, number: int) -> None:
         self._specification, self._node = specification, node
-        found = _FORM.fullmatch(node.formula)
-        scope = None if found is None else _SCOPE.fullmatch(found["scope"].strip())
-        if found is None or scope is None:
+        match = _FORM.fullmatch(node.formula)
+        scope = None if match is None else _SCOPE.fullmatch(match["scope"].strip())
+        if match is None or scope is None:
             self._refuse(f"a pattern with a condition has the form {_SHAPE}")
-        if found["verb"] == "causes":
+        if match["verb"] == "causes":
             self._refuse(
                 "`causes` cannot refer to a message; for an equal field use a parameter of the specification"
             )
-        if found["verb"] not in ("forbids", "requires") or found["alias"] is None:
+        if match["verb"] not in ("forbids", "requires") or match["alias"] is None:
             self._refuse(f"a pattern with a condition has the form {_SHAPE}")
-        self._requires = found["verb"] == "requires"
-        self._alias, self._condition = found["alias"], found["condition"]
+        self._requires = match["verb"] == "requires"
+        self._alias, self._condition = match["alias"], match["condition"]
         self._opens, self._closes = scope["opens"], scope["closes"]
-        named, other = self._event(found["first"]), self._event(found["second"])
+        named, other = self._event(match["first"]), self._event(match["second"])
         self._early, self._late = (other, named) if self._requires else (named, other)
-        self._within = None if found["within"] is None else self._duration(found)
+        self._within = None if match["within"] is None else self._duration(match)
         self._name = f"{self._late.name}_{self._alias}"
         self._prefix = _PREFIX + str(number)
 
@@ -135,7 +135,7 @@ class _Rewriting:
             declarations=(*specification.declarations, *made.declarations),
             functions=(
                 *specification.functions,
-                *(one for name, one in parts.items() if name not in _BLOCKS),
+                *(part for name, part in parts.items() if name not in _BLOCKS),
             ),
             events=tuple(events),
             properties=tuple(rewritten if one is node else one for one in specification.properties),
@@ -196,11 +196,11 @@ class _Rewriting:
             self._refuse(f"`{name}` is not an event of this specification with a message")
         return events[name]
 
-    def _duration(self, found: re.Match[str]) -> int:
+    def _duration(self, match: re.Match[str]) -> int:
         node = self._node
-        origin = node.formula_position.within(node.formula, found.start("within"))
+        origin = node.formula_position.within(node.formula, match.start("within"))
         try:
-            reader = TokenReader(Source("pattern", found["within"].rstrip(), (), origin), ())
+            reader = TokenReader(Source("pattern", match["within"].rstrip(), (), origin), ())
             within = reader.duration("a time bound")
             if reader.token.kind != "end":
                 raise reader.unexpected("the end of the pattern")

@@ -33,8 +33,8 @@ def compile_format(scope: FunctionScope, template: Value, arguments: Sequence[Va
     for written in _CONVERSION.finditer(template.constant):
         pieces.append(template.constant[last : written.start()].replace(b"%", b"%%"))
         last = written.end()
-        found = _with_widths(written, waiting)
-        if found[0] == b"%%":
+        match = _with_widths(written, waiting)
+        if match[0] == b"%%":
             pieces.append(b"%%")
             continue
         if not waiting:
@@ -43,11 +43,11 @@ def compile_format(scope: FunctionScope, template: Value, arguments: Sequence[Va
                 f"`{written[0].decode('utf-8', 'replace')}` has no argument; for a percent sign write `%%`",
             )
         value = waiting.pop(0)
-        piece, converted = _conversion(scope, found, value, template.position)
+        piece, converted = _conversion(scope, match, value, template.position)
         pieces.append(piece)
         values.append(converted)
         known = isinstance(value.constant, bytes)
-        size += _longest(found) + (len(value.constant) if isinstance(value.constant, bytes) else 0)
+        size += _longest(match) + (len(value.constant) if isinstance(value.constant, bytes) else 0)
         strings = strings or (piece[-1:] == b"s" and not known)
     if waiting:
         raise SpecificationError.at(
@@ -60,15 +60,15 @@ def compile_format(scope: FunctionScope, template: Value, arguments: Sequence[Va
     return nodes.Format(text, tuple(values), charged, scope.lines.site)
 
 
-def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes]:
-    flags, width, precision, size, letter = (part or b"" for part in found.groups())
+def _with_widths(match: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes]:
+    flags, width, precision, size, letter = (part or b"" for part in match.groups())
     if width == b"*" and (number := _literal_width(waiting)) is not None:
         flags, width = (flags, b"%d" % number) if number >= 0 else (flags + b"-", b"%d" % -number)
-    point = b"" if found[3] is None else b"." + precision
+    point = b"" if match[3] is None else b"." + precision
     if precision == b"*" and (number := _literal_width(waiting)) is not None:
         point = b".%d" % number if number >= 0 else b""
     made = _CONVERSION.fullmatch(b"%" + flags + width + point + size + letter)
-    return made if made is not None else found
+    return made if made is not None else match
 
 
 def _literal_width(waiting: list[Value]) -> int | None:
@@ -77,15 +77,15 @@ def _literal_width(waiting: list[Value]) -> int | None:
     return waiting.pop(0).constant  # type: ignore[return-value] # checked above
 
 
-def _longest(found: re.Match[bytes]) -> int:
-    return max(int(found[2] or 0), int(found[3] or 0) + (400 if found[5] in _FLOATING else 20))
+def _longest(match: re.Match[bytes]) -> int:
+    return max(int(match[2] or 0), int(match[3] or 0) + (400 if match[5] in _FLOATING else 20))
 
 
 def _conversion(
-    scope: FunctionScope, found: re.Match[bytes], value: Value, where: Position
+    scope: FunctionScope, match: re.Match[bytes], value: Value, where: Position
 ) -> tuple[bytes, nodes.Expression]:
-    flags, width, precision, size, letter = found.groups()
-    shown = found[0].decode("utf-8", "replace")
+    flags, width, precision, size, letter = match.groups()
+    shown = match[0].decode("utf-8", "replace")
     if b"*" in (width, precision) or max(int(width or 0), int(precision or 0)) > _MAX_WIDTH:
         raise SpecificationError.at(where, f"the width in `{shown}` must be a number up to {_MAX_WIDTH}")
     head = b"%" + flags + width + (b"" if precision is None else b"." + precision)

@@ -65,8 +65,8 @@ class _Trial:
         event = specification.events[remedy.event]
         try:
             open_question = self._open(place, specification, remedy, event)
-        except _UnansweredError as found:
-            self._shared.findings.append(Diagnostic(place_of_remedy(code.property), "error", str(found)))
+        except _UnansweredError as error:
+            self._shared.findings.append(Diagnostic(place_of_remedy(code.property), "error", str(error)))
             return code
         said = f"enforced: at the deadline {remedy.name} publishes the due message ({event.topic})"
         if open_question:

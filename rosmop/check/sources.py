@@ -58,13 +58,13 @@ def with_observed_topics(compiled: Compiled) -> Compiled:
 def _check(
     function: nodes.Function, event: EventCode, compiled: Compiled, symbols: Symbols
 ) -> nodes.Function:
-    found: list[nodes.Statement] = []
+    statements: list[nodes.Statement] = []
     site = symbols.site(Site(event.position))
     layout = compiled.messages.definitions.layout(event.type or "")
-    end = MessageCursor(FieldLocator(symbols, found, site), layout, nodes.Spot(None, 0)).end()
-    found.append(nodes.Ends(site, end))
-    happens = None if function.happens is None else function.happens + len(found)
-    return msgspec.structs.replace(function, body=(*found, *function.body), happens=happens)
+    end = MessageCursor(FieldLocator(symbols, statements, site), layout, nodes.Spot(None, 0)).end()
+    statements.append(nodes.Ends(site, end))
+    happens = None if function.happens is None else function.happens + len(statements)
+    return msgspec.structs.replace(function, body=(*statements, *function.body), happens=happens)
 
 
 def compiled_from(

@@ -66,13 +66,13 @@ def reached_types(node: tree.Specification, definitions: Definitions) -> frozens
         if name in services:
             service = definitions.service(name)
             waiting += [service.request.name, service.response.name]
-    found: set[str] = set()
+    types: set[str] = set()
     while waiting:
         name = waiting.pop()
-        if name in messages and name not in found:
-            found.add(name)
+        if name in messages and name not in types:
+            types.add(name)
             waiting += [field.type for field in definitions.message(name).fields]
-    return frozenset(found)
+    return frozenset(types)
 
 
 def identity(node: tree.Specification) -> bytes:
@@ -116,7 +116,7 @@ def bypassing(
     publications: Sequence[Publication],
     functions: Mapping[str, nodes.Function],
 ) -> Iterator[Diagnostic]:
-    places = {one.name: place for place, one in enumerate(specifications)}
+    places = {specification.name: place for place, specification in enumerate(specifications)}
     seen: set[tuple[str, str, str]] = set()
     for publication in publications:
         if publication.safe:

@@ -61,7 +61,7 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagn
 def kept_slices(
     name: str, events: Sequence[EventCode], properties: Sequence[PropertyCode], nodes: Sequence[tree.Property]
 ) -> list[Diagnostic]:
-    found = [
+    slices = [
         Diagnostic(
             event.position,
             "warning",
@@ -74,7 +74,7 @@ def kept_slices(
     ]
     for code, node in zip(properties, nodes, strict=True):
         for_good = _for_good(code.property)
-        found += [
+        slices += [
             Diagnostic(
                 handler.position,
                 "warning",
@@ -84,7 +84,7 @@ def kept_slices(
             for handler in node.handlers
             if handler.category in for_good and not handler.body.statements
         ]
-    return found
+    return slices
 
 
 def _for_good(compiled: CompiledProperty) -> set[str]:

@@ -24,9 +24,9 @@ def element_value(base: Value, index: Value, position: Position, site: int) -> V
         raise SpecificationError.at(
             index.position, f"index {known} is past the end of an array of {counted(kind.length, 'element')}"
         )
-    place = ElementLvalue(base, at, site) if base.place is not None else None
+    lvalue = ElementLvalue(base, at, site) if base.place is not None else None
     element = nodes.Call(kind.element, "l_element", (base.form, at), site)
-    return Value(element, position, place, owned=base.owned)
+    return Value(element, position, lvalue, owned=base.owned)
 
 
 def _vector(call: MemberCall) -> value_types.VectorType:

@@ -67,13 +67,13 @@ def _part(data: bytes, names: tuple[str, ...], shadows: tuple[str, ...]) -> byte
 
 
 def _defects(whole: Compiled, names: Collection[str]) -> list[Diagnostic]:
-    found = []
+    defects = []
     for group in whole.groups(names):
         try:
             part_of(whole, group, ())
         except (StepDiffersError, WasmError) as error:
-            found += _defect(whole, group, error)
-    return found
+            defects += _defect(whole, group, error)
+    return defects
 
 
 def _defect(whole: Compiled, names: Collection[str], error: Exception) -> list[Diagnostic]:

@@ -27,7 +27,7 @@ class SlowPath:
 
 def slow_paths(compiled: Compiled) -> list[SlowPath]:
     module = written_of(compiled)
-    found: dict[SlowPath, None] = {}
+    paths: dict[SlowPath, None] = {}
     channels = dict.fromkeys(
         event.channel for one in compiled.specifications for event in one.events if event.channel is not None
     )
@@ -37,14 +37,14 @@ def slow_paths(compiled: Compiled) -> list[SlowPath]:
         ]
         error = module.refused.get(channel)
         if error is not None:
-            found[SlowPath(channel, "", _position(compiled, channel, error), error.reason)] = None
+            paths[SlowPath(channel, "", _position(compiled, channel, error), error.reason)] = None
             continue
         sliced = [specification for specification in specifications if specification.slicing is not None]
         for one in sliced:
-            found[SlowPath(channel, "", one.position, "has a parametric specification")] = None
+            paths[SlowPath(channel, "", one.position, "has a parametric specification")] = None
         for one in specifications if not sliced else ():
-            found |= dict.fromkeys(_partly(compiled, module.left, channel, one))
-    return list(found)
+            paths |= dict.fromkeys(_partly(compiled, module.left, channel, one))
+    return list(paths)
 
 
 def _partly(

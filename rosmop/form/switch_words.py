@@ -13,14 +13,14 @@ _STATEMENT = re.compile(
 
 
 def file_switch(text: str) -> Word | None:
-    found = _STATEMENT.match(text)
-    return cast("Word | None", found[3]) if found else None
+    match = _STATEMENT.match(text)
+    return cast("Word | None", match[3]) if match else None
 
 
 def with_file_switch(text: str, word: Word | None) -> str | None:
     """Return the text with another word; None if it does not begin with a `preset` statement that can have one."""
-    found = _STATEMENT.match(text)
-    return found and f"{found[1]}{f' {word}' if word else ''}{text[found.end() :]}"
+    match = _STATEMENT.match(text)
+    return match and f"{match[1]}{f' {word}' if word else ''}{text[match.end() :]}"
 
 
 def without_file_switch(text: str) -> str:

@@ -254,9 +254,9 @@ def _target(state: StateText, event: str) -> str:
 
 
 def _state(specification: str, source: Source, name: str) -> CoverageItem:
-    found = re.search(rf"\b{name}\s*\[", source.text)
+    match = re.search(rf"\b{name}\s*\[", source.text)
     return CoverageItem(
-        specification, "state", name, source.origin.within(source.text, found.start() if found else 0)
+        specification, "state", name, source.origin.within(source.text, match.start() if match else 0)
     )
 
 

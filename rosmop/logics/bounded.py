@@ -506,15 +506,15 @@ class BoundedProperty(CompiledProperty):
         return BoundedRun(self, time_ns)
 
     def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
-        found: dict[int, _Operator] = {}
+        operators: dict[int, _Operator] = {}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
             kind = _KINDS.get(instruction.operator)
             if instruction.operator == "until" and self.later.isdisjoint(instruction.operands):
                 kind = _Until
             if kind is not None:
-                found[number] = kind(run, number, instruction)
-        return found
+                operators[number] = kind(run, number, instruction)
+        return operators
 
     def _decided_late(self) -> set[str]:
         signs: dict[int, set[bool]] = {self.program.result: {False}}

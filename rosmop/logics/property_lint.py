@@ -87,7 +87,7 @@ def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, .
 
 
 def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
-    found: dict[str, tuple[str, ...]] = {}
+    shortest_traces: dict[str, tuple[str, ...]] = {}
     traces: dict[int, tuple[str, ...]] = {graph.initial: ()}
     waiting = deque([graph.initial])
     while waiting:
@@ -95,11 +95,11 @@ def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
         for label, target in graph.edges[state]:
             trace = traces[state] + label
             for category in graph.verdicts[target]:
-                found.setdefault(category, trace)
+                shortest_traces.setdefault(category, trace)
             if target not in traces:
                 traces[target] = trace
                 waiting.append(target)
-    return found
+    return shortest_traces
 
 
 def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:

@@ -155,7 +155,7 @@ def _read_rule(reader: TokenReader, numbers: dict[str, int]) -> RewriteRule:
 
 
 def _read_symbols(reader: TokenReader, numbers: dict[str, int]) -> tuple[int, ...]:
-    found: list[FormulaToken] = []
+    tokens: list[FormulaToken] = []
     while reader.token.kind == "name":
-        found.append(reader.take())
-    return tuple(numbers.setdefault(token.text, len(numbers)) for token in found)
+        tokens.append(reader.take())
+    return tuple(numbers.setdefault(token.text, len(numbers)) for token in tokens)

@@ -115,12 +115,12 @@ class Reader:
         return tuple(TYPES[self.byte()] for _ in range(self.read_unsigned()))
 
     def block(self) -> tuple[tuple[WasmInstruction, ...], int]:
-        found: list[WasmInstruction] = []
+        instructions: list[WasmInstruction] = []
         while True:
             code = self.byte()
             if code in (_ELSE, _END):
-                return tuple(found), code
-            found.append(self.instruction(code))
+                return tuple(instructions), code
+            instructions.append(self.instruction(code))
 
     def instruction(self, code: int) -> WasmInstruction:
         if code in PLAIN:
@@ -166,7 +166,7 @@ def functions_of(module: bytes) -> list[Code]:
     """
     types: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
     chosen: list[int] = []
-    found: list[Code] = []
+    functions: list[Code] = []
     for section, content in sections(module):
         reader = Reader(content)
         for _ in range(reader.read_unsigned() if section in (_TYPES, _CHOSEN, CODES) else 0):
@@ -177,10 +177,10 @@ def functions_of(module: bytes) -> list[Code]:
                 chosen.append(reader.read_unsigned())
             else:
                 reader.read_unsigned()
-                parameters, results = types[chosen[len(found)]]
+                parameters, results = types[chosen[len(functions)]]
                 made: list[str] = []
                 for _ in range(reader.read_unsigned()):
                     count = reader.read_unsigned()
                     made += [TYPES[reader.byte()]] * count
-                found.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
-    return found
+                functions.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
+    return functions

@@ -86,7 +86,7 @@ def _definitions_of(connections: Iterable[Connection]) -> Definitions:
 
     Those with the md5sum of their connection go before all others: small client libraries send no text, or a wrong one.
     """
-    found: dict[str, MessageDefinition] = {}
+    definitions: dict[str, MessageDefinition] = {}
     doubtful: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data, row.digest) for row in connections)
     for name, text, digest in sent:
@@ -94,13 +94,13 @@ def _definitions_of(connections: Iterable[Connection]) -> Definitions:
             own = Definitions.from_full_text(name, text)
             parts = {part.name: part for part in own.parts(name)}
             if digest == own.md5sum(name):
-                found = parts | found
+                definitions = parts | definitions
             elif text.strip():
                 doubtful = parts | doubtful
         except DefinitionError:
             continue
     standard = standard_definitions().message_names
-    return Definitions({name: part for name, part in doubtful.items() if name not in standard} | found)
+    return Definitions({name: part for name, part in doubtful.items() if name not in standard} | definitions)
 
 
 def _md5sum(definitions: Definitions, kind: str, unknown: str) -> str:

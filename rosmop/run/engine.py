@@ -956,8 +956,8 @@ class MonitorSet:
         self.steps = {channel: tuple(found) for channel, found in steps.items()}
         self._withheld = {}
         for monitor in self._monitors if self._holds else ():
-            for one in monitor.code.withholdings if monitor.enabled else ():
-                self._withheld.setdefault(one.topic, []).append((monitor, one))
+            for withholding in monitor.code.withholdings if monitor.enabled else ():
+                self._withheld.setdefault(withholding.topic, []).append((monitor, withholding))
         self._contexts = {
             channel: tuple(step.monitor.context for step in found if step.first)
             for channel, found in self.steps.items()

@@ -611,11 +611,11 @@ class MonitorExecution:
             self._refuse_slice(step, refused, why, message, outcome)
 
     def _targets(self, step: Step, slices: Slices, key: Key, outcome: Outcome) -> Sequence[Slice]:
-        found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        targets = slices.targets(step.event, key, outcome.time, self._sender.source)
         if slices.behind:
             self._catch_up(step.monitor, slices.behind, outcome)
-            found = slices.targets(step.event, key, outcome.time, self._sender.source)
-        return found
+            targets = slices.targets(step.event, key, outcome.time, self._sender.source)
+        return targets
 
     def _cut(self, monitor: MonitorInstance, begun: Sequence[Slice]) -> None:
         """Undo what a message did to formulas; the runs of other properties are copies, which are not stored."""

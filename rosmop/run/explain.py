@@ -129,20 +129,20 @@ class Exits:
         return Explanation(self._named(_shortest(self._automaton, way, category) if fewest else way), fewest)
 
     def _way(self) -> list[EventOccurrence] | None:
-        found: list[EventOccurrence] = []
+        occurrences: list[EventOccurrence] = []
         state = self._automaton.initial
         while state != self._at:
             time, who, number = ENTRY.unpack_from(self.room, ENTRY.size * state)
             if (
                 who & _EVENT == _EVENT
-                or len(found) == len(self._automaton)
-                or (found and time < found[-1].time)
+                or len(occurrences) == len(self._automaton)
+                or (occurrences and time < occurrences[-1].time)
             ):
                 return None
             sender = MessageSender(who >> 32, number, who >> 24 & 0xFF)
-            found.append(EventOccurrence(who & 0xFFFFFF, time, sender))
-            state = self._automaton.table[state][found[-1].event]
-        return found
+            occurrences.append(EventOccurrence(who & 0xFFFFFF, time, sender))
+            state = self._automaton.table[state][occurrences[-1].event]
+        return occurrences
 
     def _named(self, way: Sequence[EventOccurrence]) -> tuple[EventOccurrence, ...]:
         automaton, state, found = self._automaton, self._automaton.initial, []
@@ -408,12 +408,12 @@ def of_slice(
             own[happened[-1]] = bound.everywhere
     if not happened:
         return None
-    found = Steps(compiled, happened[0].time)
+    steps = Steps(compiled, happened[0].time)
     for event in happened:
-        found.add(event)
+        steps.add(event)
     if passed is not None:
-        found.add(EventOccurrence(_DEADLINE, passed, NOBODY))
-    why = found.explain(category)
+        steps.add(EventOccurrence(_DEADLINE, passed, NOBODY))
+    why = steps.explain(category)
     return why if why is not None and all(own[event] for event in why.events) else None
 
 

@@ -229,7 +229,7 @@ class MonitorInstance:
     @property
     def awaits(self) -> str:
         """Return the nodes, with their topics, without whose messages it does not go on, or an empty text."""
-        rows = ((topic, one.awaited) for topic, one in self.sources.items())
+        rows = ((topic, source.awaited) for topic, source in self.sources.items())
         return "; ".join(
             f"{', '.join(nodes).replace(chr(0), '…')} on {topic}" for topic, nodes in rows if nodes
         )

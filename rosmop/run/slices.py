@@ -672,11 +672,11 @@ def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
         return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
     assert isinstance(compiled, ClockedProperty)  # noqa: S101  the caller checks this
     verdicts = compiled.verdicts
-    found = []
+    steps = []
     for early, late, wait in zip(compiled.moves, compiled.late, compiled.waits, strict=True):
         ways = [(target, verdicts[target]) for target, _ in (*early, *late)]
-        found.append(ways if wait is None else [*ways, (wait.move[0], wait.categories)])
-    return found
+        steps.append(ways if wait is None else [*ways, (wait.move[0], wait.categories)])
+    return steps
 
 
 def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:

@@ -77,7 +77,7 @@ GroupSnapshot = tuple[Sequence[str], bytes, bytes, bytes | None]
 def states_of(
     groups: Sequence[GroupSnapshot],
 ) -> tuple[dict[str, MonitorSnapshot], dict[str, list[SliceSnapshot]], dict[str, str]]:
-    found: dict[str, MonitorSnapshot] = {}
+    snapshots: dict[str, MonitorSnapshot] = {}
     slices: dict[str, list[SliceSnapshot]] = {}
     lost: dict[str, str] = {}
     for group in groups:
@@ -91,10 +91,10 @@ def states_of(
         for name in group[0]:
             if isinstance(states, list):
                 slices[name] = []
-            found.pop(name, None)
+            snapshots.pop(name, None)
             lost[name] = states if isinstance(states, str) else "its state was not written"
-        found |= {state.name: state for state in states if isinstance(state, MonitorSnapshot)}
-    return found, slices, {name: why for name, why in lost.items() if name not in found}
+        snapshots |= {state.name: state for state in states if isinstance(state, MonitorSnapshot)}
+    return snapshots, slices, {name: why for name, why in lost.items() if name not in snapshots}
 
 
 _DECODER: msgspec.msgpack.Decoder[list[MonitorSnapshot] | PartSnapshot | str] = msgspec.msgpack.Decoder(
@@ -148,8 +148,8 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Value], types
         {name: variables[code] for name, code in monitor.code.variables.items()},
         first,
         {
-            topic: (one.first, sorted(one.unreadable), one.waits, sorted(one.known))
-            for topic, one in monitor.sources.items()
+            topic: (source.first, sorted(source.unreadable), source.waits, sorted(source.known))
+            for topic, source in monitor.sources.items()
         },
     )
 

@@ -226,11 +226,11 @@ def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> i
 
 def parse_floating(text: bytes, bits: int, site: int) -> float:
     """`std::stod` or `std::stof`, which fault where C++ throws."""
-    found = _FLOATING.match(text[:1000])
-    if found is None:
+    match = _FLOATING.match(text[:1000])
+    if match is None:
         raise FaultError(site, "the string does not begin with a number")
-    value = float(found[1]) if bits == 64 else f32(float(found[1]))
-    digits = re.split(rb"[eE]", found[1])[0]
+    value = float(match[1]) if bits == 64 else f32(float(match[1]))
+    digits = re.split(rb"[eE]", match[1])[0]
     if digits[-1:] in b"0123456789." and (math.isinf(value) or (not value and digits.strip(b"+-0."))):
         raise FaultError(site, f"the number does not fit into {'a double' if bits == 64 else 'a float'}")
     return value
@@ -238,11 +238,11 @@ def parse_floating(text: bytes, bits: int, site: int) -> float:
 
 def lenient_integer(text: bytes) -> int:
     """`atoi(text)`: 0 for text that is not a number."""
-    found = re.match(rb"\s*+[+-]?[0-9]{1,18}+", text[:1000])
-    return int(found[0]) if found else 0
+    match = re.match(rb"\s*+[+-]?[0-9]{1,18}+", text[:1000])
+    return int(match[0]) if match else 0
 
 
 def lenient_floating(text: bytes) -> float:
     """`atof(text)`: 0 for text that is not a number."""
-    found = _FLOATING.match(text[:1000])
-    return float(found[1]) if found else 0.0
+    match = _FLOATING.match(text[:1000])
+    return float(match[1]) if match else 0.0

@@ -66,7 +66,7 @@ class BothWays:
         published: list[Published] = []
         for body in bodies:
             outcome = self.interpreter.process(topic, bytearray(body), time)
-            self.interpreted += (one for each in (*outcome.before, outcome) for one in each.verdicts)
+            self.interpreted += (verdict for each in (*outcome.before, outcome) for verdict in each.verdicts)
             lines += (line for each in (*outcome.before, outcome) for line in each.log)
             published += (one for each in (*outcome.before, outcome) for one in each.published)
             self.came[outcome.result if not outcome.faults else "fault"] += 1

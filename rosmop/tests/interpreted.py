@@ -20,11 +20,11 @@ def beside(monitors: MonitorSet) -> MonitorSet:
     return MonitorSet(compiled, monitors.on_fault, monitors.patience)
 
 
-def check_same(one: Outcome, other: Outcome) -> None:
-    assert _told(one) == _told(other)
-    for fault, other_fault in zip(one.faults, other.faults, strict=True):
+def check_same(outcome: Outcome, other: Outcome) -> None:
+    assert _told(outcome) == _told(other)
+    for fault, other_fault in zip(outcome.faults, other.faults, strict=True):
         assert repr(sorted(fault.values.items())) == repr(sorted(other_fault.values.items()))
-    for before, other_before in zip(one.before, other.before, strict=True):
+    for before, other_before in zip(outcome.before, other.before, strict=True):
         check_same(before, other_before)
 
 

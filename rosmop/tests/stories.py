@@ -193,7 +193,7 @@ def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str
     head: str = outcome.result
     if outcome.result == "changed":
         head += f" {fields_of(kind, bytes(outcome.buffer))} by {', '.join(outcome.changed_by)}"
-        head += f" at {','.join(f'{one.line}:{one.column}' for one in outcome.changed_at)}"
+        head += f" at {','.join(f'{position.line}:{position.column}' for position in outcome.changed_at)}"
     if outcome.result == "dropped":
         head += f" by {outcome.dropped_by}"
         head += f" at {outcome.dropped_at.line}:{outcome.dropped_at.column}" if outcome.dropped_at else ""

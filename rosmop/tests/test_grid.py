@@ -90,8 +90,8 @@ SLOW = {
 def test_slow_paths_have_places_and_reasons(name: str) -> None:
     body, expected = SLOW[name]
     compiled = compiled_from({"s.rv": f"{HEAD}{body} }}"}, standard_definitions())
-    found = slow_paths(compiled)
-    assert [(one.topic, one.code, one.position.line, one.reason) for one in found] == expected
+    paths = slow_paths(compiled)
+    assert [(path.topic, path.code, path.position.line, path.reason) for path in paths] == expected
 
 
 def test_parametric_specifications_are_slow_paths() -> None:

@@ -43,7 +43,7 @@ class Phase:
         parts += [
             f"pattern: globally: {x} causes {y} within {w} ns enforced by f_{y}" for x, y, w in self.due
         ]
-        parts += [f"pattern: {one.text()} @violation {{ DROP; }}" for one in self.forbidden]
+        parts += [f"pattern: {meaning.text()} @violation {{ DROP; }}" for meaning in self.forbidden]
         return f"{name}() {{ std_msgs::Empty m; {' '.join(parts)} }}"
 
     @staticmethod
@@ -51,7 +51,7 @@ class Phase:
         return "" if event is None else f"PUBLISH(/{event}, std_msgs/Empty, m);"
 
     def forbids(self, time: int, event: str) -> bool:
-        return any(one.unmet((*self.seen, (time, event)), time)[0] for one in self.forbidden)
+        return any(meaning.unmet((*self.seen, (time, event)), time)[0] for meaning in self.forbidden)
 
     def deadlines(self) -> Iterator[tuple[int, int]]:
         self.tried = self.tried or [0] * len(self.due)
@@ -238,8 +238,8 @@ def test_an_order_replaces_the_order_of_the_files(order: str, speed: list[float]
     unknown = [str(one) for one in monitors.warnings if "no specification is named `other`" in one.text]
     assert bool(unknown) is ("other" in order)
     plain = load(CAP, y=MUX)
-    assert [one.code.identity for one in sorted(monitors.monitors, key=lambda one: one.name)] == [
-        one.code.identity for one in sorted(plain.monitors, key=lambda one: one.name)
+    assert [monitor.code.identity for monitor in sorted(monitors.monitors, key=lambda one: one.name)] == [
+        monitor.code.identity for monitor in sorted(plain.monitors, key=lambda one: one.name)
     ]
 
 

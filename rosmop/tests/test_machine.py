@@ -41,55 +41,55 @@ def made(text: str, limit: int = LIMIT, pages: str = "1") -> WasmInstance:
     return run(bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") {pages}) {text})')), limit)
 
 
-def trap_of(one: WasmInstance, name: str | int, *arguments: int, fuel: int = FUEL) -> WasmTrap:
+def trap_of(instance: WasmInstance, name: str | int, *arguments: int, fuel: int = FUEL) -> WasmTrap:
     with pytest.raises(WasmTrap) as caught:
-        one.call(name, *arguments, fuel=fuel)
+        instance.call(name, *arguments, fuel=fuel)
     return caught.value
 
 
 def test_arguments_and_results_by_name_and_number() -> None:
-    one = made("""
+    instance = made("""
         (func (export "first") (param f64))
         (func (export "mixed") (param i32 i64 i32) (result i64)
             (i64.sub (i64.mul (i64.extend_i32_s (local.get 0)) (local.get 1)) (i64.extend_i32_s (local.get 2))))
         (func (export "narrow") (param i64) (result i32) (i32.wrap_i64 (local.get 0)))
         (func (export "none"))""")
-    assert one.call("mixed", -3, 1 << 40, 7, fuel=FUEL) == -3 * (1 << 40) - 7
-    assert one.call(0, 0xFFFFFFFF, 5, -1, fuel=FUEL) == -4, "of a wider argument its 32 bits"
-    assert one.call("narrow", -1, fuel=FUEL) == one.call(1, (1 << 32) - 1, fuel=FUEL) == -1
-    assert one.call("none", fuel=FUEL) is one.call(2, fuel=FUEL) is None
+    assert instance.call("mixed", -3, 1 << 40, 7, fuel=FUEL) == -3 * (1 << 40) - 7
+    assert instance.call(0, 0xFFFFFFFF, 5, -1, fuel=FUEL) == -4, "of a wider argument its 32 bits"
+    assert instance.call("narrow", -1, fuel=FUEL) == instance.call(1, (1 << 32) - 1, fuel=FUEL) == -1
+    assert instance.call("none", fuel=FUEL) is instance.call(2, fuel=FUEL) is None
     for name in ("first", "other", 3, "memory"):
         with pytest.raises(WasmError, match="has no function"):
-            one.call(name, fuel=FUEL)
+            instance.call(name, fuel=FUEL)
 
 
 @pytest.mark.parametrize("arguments", [(), (1, 2), (1 << 63,), (0.5,)])
 def test_other_arguments(arguments: tuple[int, ...]) -> None:
-    one = made("""(func (export "mark") (param i64) (i32.store (i32.const 0) (i32.const 1)))""")
+    instance = made("""(func (export "mark") (param i64) (i32.store (i32.const 0) (i32.const 1)))""")
     with pytest.raises(struct.error):
-        one.call("mark", *arguments, fuel=FUEL)
-    assert one.memory[0] == 0
+        instance.call("mark", *arguments, fuel=FUEL)
+    assert instance.memory[0] == 0
 
 
 @pytest.mark.parametrize("reason", TRAPS)
 def test_every_trap_has_its_reason_and_the_machine_goes_on(reason: str) -> None:
-    one = made(f"""(type $none (func)) (table 2 funcref) (elem (i32.const 1) $other)
+    instance = made(f"""(type $none (func)) (table 2 funcref) (elem (i32.const 1) $other)
         (func $other (param i32))
         (func $self (export "fail") (i32.store (i32.const 8) (i32.const 7)) {TRAPS[reason]})
         (func (export "fine") (result i32) (i32.load (i32.const 8)))""")
     for _ in range(3):
-        trap = trap_of(one, "fail", fuel=100_000_000)
+        trap = trap_of(instance, "fail", fuel=100_000_000)
         assert (trap.reason, str(trap)) == (reason, reason)
-        assert one.call("fine", fuel=FUEL) == 7
+        assert instance.call("fine", fuel=FUEL) == 7
 
 
 def test_each_call_has_its_own_fuel() -> None:
-    one = made("""(func (export "turns") (param i32)
+    instance = made("""(func (export "turns") (param i32)
         (loop (br_if 0 (local.tee 0 (i32.sub (local.get 0) (i32.const 1))))))""")
 
     def is_enough(fuel: int) -> bool:
         try:
-            one.call("turns", 1000, fuel=fuel)
+            instance.call("turns", 1000, fuel=fuel)
         except WasmTrap as trap:
             assert trap.reason == "out of fuel"
             return False
@@ -98,13 +98,13 @@ def test_each_call_has_its_own_fuel() -> None:
     least = next(fuel for fuel in range(1000, 20_000) if is_enough(fuel))
     assert all(is_enough(least) for _ in range(3))
     assert not is_enough(least - 1)
-    assert trap_of(one, "turns", 1, fuel=0).reason == "out of fuel"
+    assert trap_of(instance, "turns", 1, fuel=0).reason == "out of fuel"
 
 
 def test_bytes_that_are_copied_use_fuel() -> None:
-    one = made("""(func (export "fill") (memory.fill (i32.const 0) (i32.const 1) (i32.const 65536)))""")
-    assert trap_of(one, "fill", fuel=60_000).reason == "out of fuel"
-    one.call("fill", fuel=70_000)
+    instance = made("""(func (export "fill") (memory.fill (i32.const 0) (i32.const 1) (i32.const 65536)))""")
+    assert trap_of(instance, "fill", fuel=60_000).reason == "out of fuel"
+    instance.call("fill", fuel=70_000)
 
 
 def test_an_unknown_wasmtime_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,10 +138,10 @@ def test_the_memory_grows_in_place_and_views_stay_right() -> None:
 
 @pytest.mark.parametrize("limit", [PAGE, 3 * PAGE, 5 * PAGE + 1])
 def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
-    one = made("", limit)
-    one.reserve(limit // PAGE * PAGE)
+    instance = made("", limit)
+    instance.reserve(limit // PAGE * PAGE)
     with pytest.raises(WasmError):
-        one.reserve(limit // PAGE * PAGE + 1)
+        instance.reserve(limit // PAGE * PAGE + 1)
 
 
 @pytest.mark.parametrize(
@@ -189,14 +189,14 @@ def test_other_threads_go_on_while_a_module_is_translated() -> None:
 
 
 def test_a_view_outlives_its_machine() -> None:
-    one = made("")
-    view = one.memory[10:20]
+    instance = made("")
+    view = instance.memory[10:20]
     view[0] = 3
-    one.close()
-    one.close()
+    instance.close()
+    instance.close()
     many = [made("", pages="4") for _ in range(50)]
     assert (view[0], len(many)) == (3, 50)
-    for use in (lambda: one.memory, lambda: one.reserve(1), lambda: one.call("f", fuel=1)):
+    for use in (lambda: instance.memory, lambda: instance.reserve(1), lambda: instance.call("f", fuel=1)):
         with pytest.raises(WasmError, match="closed"):
             use()
 
@@ -239,13 +239,13 @@ def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: 
         code[at] = value
     other = made("", PAGE)
     with contextlib.suppress(WasmError, WasmTrap):
-        one = run(bytes(code[:length]))
+        instance = run(bytes(code[:length]))
         for number in range(8):
             for arguments in ((), (argument,), (argument, 3), (argument, 3, argument)):
                 with contextlib.suppress(WasmError, WasmTrap, struct.error):
-                    one.call(number, *arguments, fuel=10_000)
-        assert len(one.memory) <= LIMIT
-        one.memory[:] = bytes(len(one.memory))
+                    instance.call(number, *arguments, fuel=10_000)
+        assert len(instance.memory) <= LIMIT
+        instance.memory[:] = bytes(len(instance.memory))
     assert bytes(other.memory) == bytes(PAGE)
 
 
@@ -254,15 +254,15 @@ def resident() -> int:
 
 
 def test_calls_and_traps_leave_nothing_behind() -> None:
-    one = made("""(func $deep (export "fail") (param i32)
+    instance = made("""(func $deep (export "fail") (param i32)
             (if (local.get 0) (then (call $deep (i32.sub (local.get 0) (i32.const 1))))) unreachable)
         (func (export "fine"))""")
 
     def use(calls: int, machines: int) -> None:
         for _ in range(calls):
-            one.call("fine", fuel=FUEL)
+            instance.call("fine", fuel=FUEL)
             try:
-                one.call("fail", 1, fuel=FUEL)
+                instance.call("fail", 1, fuel=FUEL)
             except WasmTrap:
                 continue
         for _ in range(machines):

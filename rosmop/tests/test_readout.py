@@ -29,8 +29,8 @@ def read(text: str, *values: int, later: int = 0) -> Readout:
 
 def test_variables_are_as_the_last_message_left_them() -> None:
     variables = "int n = 0; bool on = false; double d = NAN; std::string s; ros::Duration took(0.5);"
-    found = read(on('n += x; on = true; d = x / 2.0; s = "é";', variables), 3, 4)
-    assert found == ({"n": 7, "on": True, "d": 2.0, "s": "é", "took": 0.5}, {})
+    readout = read(on('n += x; on = true; d = x / 2.0; s = "é";', variables), 3, 4)
+    assert readout == ({"n": 7, "on": True, "d": 2.0, "s": "é", "took": 0.5}, {})
 
 
 def test_numbers_that_are_not_finite_are_text() -> None:

@@ -52,7 +52,7 @@ def test_a_stop_replaces_the_message_and_keeps_its_stamp() -> None:
     monitors.process("/scan", NEAR, 1)
     outcome = monitors.process("/cmd_vel", bytearray(command()), 2)
     assert (outcome.result, bytes(outcome.buffer)) == ("changed", SAFE_BYTES)
-    assert (outcome.changed_by, [one.line for one in outcome.changed_at]) == (("guard.drive",), [1])
+    assert (outcome.changed_by, [position.line for position in outcome.changed_at]) == (("guard.drive",), [1])
     assert monitors.process("/cmd_vel", SAFE_BYTES, 3).result == "passed"
 
 

@@ -245,7 +245,7 @@ def test_specifications_that_share_variables_are_in_shadow_mode_together() -> No
         f"c() {{ event e({NUMBER} {{ n = 7; }} }}",
         shadowed=["b"],
     )
-    assert [one.name for one in monitors.shadowed] == ["a", "b"]
+    assert [outcome.name for outcome in monitors.shadowed] == ["a", "b"]
     assert [monitor.name for monitor in monitors.monitors] == ["c"]
     for data in (1, 2, 3):
         monitors.process("/n", number(data), data)

@@ -68,11 +68,11 @@ def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
 
 
 def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
-    found: list[Outcome] = []
+    outcomes: list[Outcome] = []
     for _ in range(1000):
-        found += monitors.advance(end)
+        outcomes += monitors.advance(end)
         if monitors.next_due is None or monitors.next_due > end:
-            return found
+            return outcomes
     raise AssertionError("deadlines without end")
 
 

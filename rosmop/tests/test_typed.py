@@ -61,11 +61,11 @@ def test_a_command_that_cannot_stop_is_dropped_and_its_goals_are_cancelled() -> 
     assert "DropStatement" in repr(drive) and "StopStatement" not in repr(drive)
     assert "PublishStatement" in repr(tick) and "StopStatement" not in repr(tick)
     [code] = compiled_from({"x.rv": text}, definitions()).specifications
-    assert ({*code.safes}, [one.topic for one in code.given_topics]) == (set(), ["/arm/goal"])
+    assert ({*code.safes}, [given_topic.topic for given_topic in code.given_topics]) == (set(), ["/arm/goal"])
     loaded = compiled_from(
         {"x.rv": text}, definitions(), topics={"s": {"command": "/leg/goal", "cancel": "/x"}}
     )
-    assert {one.topic for one in loaded.publications} == {"/leg/cancel"}
+    assert {publication.topic for publication in loaded.publications} == {"/leg/cancel"}
     for both in ("cancel = /x; topic command : Command", "command : Command = /cmd_vel; topic cancel"):
         errors = refused(text.replace("command : Command", both, 1))
         assert [error.text for error in errors] == ["the topic `cancel` is given twice"]

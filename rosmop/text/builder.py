@@ -213,15 +213,15 @@ class TreeBuilder(Transformer_NonRecursive[Token, tree.TypedFile]):
 
     def given_value(self, meta: Meta, *children: Token) -> tree.GivenValue:
         *words, name, value = children
-        found = _GIVEN.fullmatch(value.strip())
-        if found is None:
+        match = _GIVEN.fullmatch(value.strip())
+        if match is None:
             text = "write a number, its unit and its range, such as `0.22 m/s in 0..2`, or `true` or `false`"
             self.refuse(value, text)
             return tree.GivenValue(self.at(meta), tuple(map(str, words)), str(name), "0", "", None)
-        bounds = None if found["least"] is None else (found["least"], found["most"])
+        bounds = None if match["least"] is None else (match["least"], match["most"])
         kind = tuple(map(str, words))
         return tree.GivenValue(
-            self.at(meta), kind, str(name), found["value"], (found["unit"] or "").strip(), bounds
+            self.at(meta), kind, str(name), match["value"], (match["unit"] or "").strip(), bounds
         )
 
     def given_topic(
@@ -692,14 +692,14 @@ def _resource(name: Token, kind: Token) -> tuple[str, str]:
 
 
 def _duration_ns(text: str) -> int:
-    found = _DURATION.match(text)
-    if found is None or len(found[1]) > 30:
+    match = _DURATION.match(text)
+    if match is None or len(match[1]) > 30:
         raise _LiteralError("this is not a duration; write for example `100ms`, `0.5s` or `2m`")
-    if found[2] not in _UNITS_NS:
+    if match[2] not in _UNITS_NS:
         units = ", ".join(unit for unit in _UNITS_NS if unit)
-        raise _LiteralError(f"`{found[2][:20]}` is not a unit of time; write one of {units}")
-    number = found[1] if found[1][0] != "." else "0" + found[1]
-    result = Fraction(number.rstrip(".") if number.endswith(".") else number) * _UNITS_NS[found[2]]
+        raise _LiteralError(f"`{match[2][:20]}` is not a unit of time; write one of {units}")
+    number = match[1] if match[1][0] != "." else "0" + match[1]
+    result = Fraction(number.rstrip(".") if number.endswith(".") else number) * _UNITS_NS[match[2]]
     if result.denominator != 1 or not MIN_PERIOD_NS <= result <= MAX_PERIOD_NS:
         raise _LiteralError("a period is from 1 ms to 31 years, and a whole number of nanoseconds")
     return int(result)

@@ -130,8 +130,8 @@ def _shape(pattern: str, advice: _Advice, *depths: int) -> _Shape:
     return _Shape(re.compile(pattern), advice, frozenset(depths or (0, 1, 2)))
 
 
-def _hexadecimal(found: re.Match[str]) -> str:
-    value = int(found[0].replace("'", "_"), 2)
+def _hexadecimal(match: re.Match[str]) -> str:
+    value = int(match[0].replace("'", "_"), 2)
     return f"write `{value:#x}`"
 
 
@@ -139,15 +139,15 @@ def _replace(pattern: str, by: str, template: str = "write `{}`") -> Callable[[r
     return lambda found: template.format(re.sub(pattern, by, found[0].strip()))
 
 
-def _as_float(found: re.Match[str]) -> str:
+def _as_float(match: re.Match[str]) -> str:
     try:
-        return f"write `{float.fromhex(found[0])!r}`"
+        return f"write `{float.fromhex(match[0])!r}`"
     except OverflowError:
         return "write it in decimal"
 
 
-def _of_template(found: re.Match[str]) -> str:
-    return _INSTEAD[found["template"]]
+def _of_template(match: re.Match[str]) -> str:
+    return _INSTEAD[match["template"]]
 
 
 _SCOPED = r"(?:\w+\s*::\s*)*\w+"

@@ -89,10 +89,10 @@ class _Maker:
         written, preset = self.written, self.preset
         known = written.known if isinstance(written, tree.TypedSpecification) else written
         settings: dict[str, tree.Setting] = {}
-        for one in preset.settings if preset else ():
-            if one.name in settings:
-                self._refuse(one.position, f"{quote(one.name)} is set twice")
-            settings[one.name] = one
+        for setting in preset.settings if preset else ():
+            if setting.name in settings:
+                self._refuse(setting.position, f"{quote(setting.name)} is set twice")
+            settings[setting.name] = setting
         if isinstance(written, tree.TypedSpecification):
             self._check_names(written)
         givens = tuple(
@@ -131,8 +131,8 @@ class _Maker:
             raise SpecificationError(self.findings)
         return _with_values_of_roles(result, self.topics.values())
 
-    def _refuse(self, place: Position, text: str) -> None:
-        self.findings.append(Diagnostic(place, "error", text))
+    def _refuse(self, position: Position, text: str) -> None:
+        self.findings.append(Diagnostic(position, "error", text))
 
     def _check_names(self, written: tree.TypedSpecification) -> None:
         seen = set()
@@ -142,9 +142,9 @@ class _Maker:
             seen.add(given.name)
 
     def _check_settings(self, settings: Mapping[str, tree.Setting], names: list[str]) -> None:
-        for name, one in settings.items():
+        for name, setting in settings.items():
             if name not in names:
-                self._refuse(one.position, f"{quote(name)} is not given to it{nearest(name, names)}")
+                self._refuse(setting.position, f"{quote(name)} is not given to it{nearest(name, names)}")
 
     # Givens
 
@@ -174,10 +174,10 @@ class _Maker:
             return replace(node, topic=setting.value)
         return replace(node, position=place, default=self._constant(node, setting))
 
-    def _check_topic(self, name: str, topic: str, place: Position) -> None:
+    def _check_topic(self, name: str, topic: str, position: Position) -> None:
         if not is_global_name(topic):
             only = ", without a type" if is_global_name(topic.partition(" ")[0]) else ""
-            self._refuse(place, f"{quote(topic)} is not a topic; write it like {name} = /cmd_vel{only}")
+            self._refuse(position, f"{quote(topic)} is not a topic; write it like {name} = /cmd_vel{only}")
 
     def _constant(self, node: tree.GivenValue, setting: tree.Setting) -> str:
         value = setting.value
@@ -198,7 +198,7 @@ class _Maker:
             )
             return node.default
 
-    def _choose(self, node: tree.TypedTopic, topic: str, kind: str, place: Position) -> None:
+    def _choose(self, node: tree.TypedTopic, topic: str, kind: str, position: Position) -> None:
         role = self._role(node.role, node.position)
         if role is None:
             return
@@ -206,12 +206,12 @@ class _Maker:
         kind = kind or next(iter(rows), "")
         if not kind:
             text = f"no type of {topic} is known; begin {role.name} with a row, such as `std_msgs/Bool '{{data:x}}';`"
-            self._refuse(place, text)
+            self._refuse(position, text)
             return
         row = rows.get(kind) or (rows.get("") if kind else None)
         if row is None:
             text = f"{topic} cannot have the type {quote(kind)}; {role.name} has {', '.join(rows)}"
-            self._refuse(place, text)
+            self._refuse(position, text)
             return
         self.topics[node.name] = _Chosen(topic, kind, role, row)
 
@@ -232,7 +232,7 @@ class _Maker:
             chain[-1], parameters=parameters, rows=tuple(row for role in chain for row in role.rows)
         )
 
-    def _list(self, node: tree.GivenList, value: str, place: Position) -> None:
+    def _list(self, node: tree.GivenList, value: str, position: Position) -> None:
         name = node.name
         try:
             match node.kind:
@@ -256,7 +256,7 @@ class _Maker:
         except ValueError as error:
             why = f"{error}; " if str(error) else ""
             self._refuse(
-                place, f"{quote(value)}: {why}write it like {name} = {given_lists.EXAMPLES[node.kind]}"
+                position, f"{quote(value)}: {why}write it like {name} = {given_lists.EXAMPLES[node.kind]}"
             )
 
     def _table(self, node: tree.GivenList, of: str, name: str, cells: Iterable[str]) -> None:

@@ -67,8 +67,8 @@ def check(
 
 
 def _say_slow(compiled: Compiled, *, as_json: bool) -> None:
-    found = slow_paths(compiled)
-    for path in found:
+    paths = slow_paths(compiled)
+    for path in paths:
         if as_json:
             say_json(
                 {"topic": path.topic, "code": path.code, **asdict(path.position), "why_slow": path.reason}
@@ -77,7 +77,7 @@ def _say_slow(compiled: Compiled, *, as_json: bool) -> None:
             say(f"{path.position}: {path.topic}: {path.code}: interpreted here, because it {path.reason}")
         else:
             say(f"{path.position}: {path.topic}: each message is interpreted, because it {path.reason}")
-    if not found and not as_json:
+    if not paths and not as_json:
         here = (
             ""
             if find_spec("wasmtime") is not None

@@ -16,11 +16,11 @@ def last_messages(spans: Spans, topics: Mapping[str, str], most: int) -> dict[st
     Raises:
         RecordingError: A recording cannot be read.
     """
-    found: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in topics}
+    messages: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in topics}
     for _name, path, (since, until) in spans:
         with closing(open_recording(path)) as reader:
             for connection, time, data in messages_of(reader):
                 if topics.get(connection.topic) == ros_type(connection.msgtype) and since <= time <= until:
-                    found[connection.topic].append((time, bytes(data)))
-                    del found[connection.topic][:-most]
-    return found
+                    messages[connection.topic].append((time, bytes(data)))
+                    del messages[connection.topic][:-most]
+    return messages

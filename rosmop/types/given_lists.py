@@ -20,7 +20,7 @@ def fault_of(corners: Sequence[Corner]) -> str:
     edges = [edge for edge in pairwise([*corners, corners[0]]) if edge[0] != edge[1]]
     if not edges or all(_turn(*edges[0], corner) == 0 for corner in corners):
         return "the corners are on one line"
-    if any(_cross(*one, *other) for one, other in combinations(edges, 2)):
+    if any(_cross(*edge, *other) for edge, other in combinations(edges, 2)):
         return "edges cross"
     return ""
 
@@ -90,10 +90,10 @@ def entries(value: str) -> tuple[tuple[str, str], ...]:
     """Return each text, and where entries have it: 0: name, 1: its beginning, 2: hardware_id, 3: its beginning."""
     rows: list[tuple[str, str]] = []
     for word in value.split(","):
-        found = _ENTRY.fullmatch(word.strip())
-        if found is None or not found[2] + found[3] or "//" in found[2] or "/*" in found[2]:
+        match = _ENTRY.fullmatch(word.strip())
+        if match is None or not match[2] + match[3] or "//" in match[2] or "/*" in match[2]:
             raise ValueError
-        rows.append((found[2], str(2 * bool(found[1]) + bool(found[3]))))
+        rows.append((match[2], str(2 * bool(match[1]) + bool(match[3]))))
     if len(rows) > _MAX_ENTRIES:
         raise ValueError(f"at most {_MAX_ENTRIES} entries can be named")
     return tuple(rows)

@@ -96,16 +96,16 @@ class MessageTypes:
     def _paths_to(self, name: str, field: str) -> list[str]:
         level = [("", name)]
         for _ in range(3):
-            found = []
+            paths = []
             below = []
             for prefix, record in level[:200]:
                 for slot in self.slots(record).values():
                     if slot.name == field and prefix:
-                        found.append(f"{prefix}{slot.name}")
+                        paths.append(f"{prefix}{slot.name}")
                     if isinstance(slot.type, value_types.RecordType):
                         below.append((f"{prefix}{slot.name}.", slot.type.name))
-            if found:
-                return found
+            if paths:
+                return paths
             level = below
         return []
 

@@ -349,7 +349,7 @@ class SendQueues:
         wanted = size - own.bytes if own.pinned else size  # a pinned message is replaced
         while reason := self.memory.refusal(wanted):
             longest = max(
-                (one for one in self.queues if one.frames), key=lambda queue: queue.bytes, default=None
+                (queue for queue in self.queues if queue.frames), key=lambda queue: queue.bytes, default=None
             )
             if longest is None or (claim >= longest.bytes and not own.frames):
                 return reason

@@ -84,9 +84,9 @@ def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value
     """Return the method and its parameters (of a multicall: of all parts), or None unless all are scalars."""
     if not _fits(body, limits):
         return None
-    found = _CALL.match(body) if len(body) <= _LONGEST else None
-    if found is not None:
-        return found[1].decode(), _values(found[2])
+    match = _CALL.match(body) if len(body) <= _LONGEST else None
+    if match is not None:
+        return match[1].decode(), _values(match[2])
     calls = _several(body, limits, (_CALLS, _CALL_IN, _CALLS_END), _call)
     return None if calls is None else ("system.multicall", [calls])
 
@@ -95,9 +95,9 @@ def read_common_answer(body: bytes, limits: XmlRpcLimits) -> list[Value] | None:
     """Return the answers, or None unless each is a list of scalars, of which the last may be a list of scalars."""
     if not _fits(body, limits):
         return None
-    found = _ANSWER.match(body) if len(body) <= _LONGEST else None
-    if found is not None:
-        return _list(*found.groups())
+    match = _ANSWER.match(body) if len(body) <= _LONGEST else None
+    if match is not None:
+        return _list(*match.groups())
     return _several(body, limits, (_ANSWERS, _ANSWER_IN, _ANSWERS_END), _answer)
 
 

@@ -214,10 +214,10 @@ class XmlRpcDocument:
 
     def _integer(self) -> int:
         text = self._scalar()
-        found = _INTEGER.match(text)
-        if found is None:
+        match = _INTEGER.match(text)
+        if match is None:
             raise self._error(f"integer {text[:40]!a}")
-        number = int(found[1])
+        number = int(match[1])
         if not -0x80000000 <= number <= 0x7FFFFFFF:
             raise self._error(f"integer {text[:40]!a}: XML-RPC integers have 32 bits")
         return number
@@ -230,17 +230,17 @@ class XmlRpcDocument:
 
     def _double(self) -> float:
         text = self._scalar()
-        found = _DOUBLE.match(text)
-        if found is None:
+        match = _DOUBLE.match(text)
+        if match is None:
             raise self._error(f"double {text[:40]!a}")
-        return float(found[1])
+        return float(match[1])
 
     def _date_time(self) -> datetime:
         text = self._scalar()
-        found = _DATE_TIME.match(text)
+        match = _DATE_TIME.match(text)
         try:
-            if found is not None:
-                year, month, day, hour, minute, second = map(int, found.groups())
+            if match is not None:
+                year, month, day, hour, minute, second = map(int, match.groups())
                 return datetime(year, month, day, hour, minute, second)  # noqa: DTZ001 - XML-RPC has no time zones
         except ValueError:
             pass

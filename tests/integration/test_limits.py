@@ -57,7 +57,7 @@ def seconds_for(listener: Process, count: int, since: float) -> float:
 
 
 def judged(appliance: Appliance) -> int:
-    [row] = [one for one in appliance.rosrv("monitor", "list").stdout.splitlines() if "counter" in one]
+    [row] = [line for line in appliance.rosrv("monitor", "list").stdout.splitlines() if "counter" in line]
     return int(row.split()[3])
 
 

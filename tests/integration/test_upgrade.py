@@ -165,11 +165,11 @@ def test_rows_survive(upgraded: Upgraded) -> None:
 def test_doors_hosts_and_blocks_survive(upgraded: Upgraded) -> None:
     rest = upgraded.appliance.rest(upgraded.token)
     doors = rest.get("/v1/doors").json["doors"]
-    assert {one["name"]: (one["address"], one["port"], one["source"], len(one["tickets"])) for one in doors} == {
+    assert {door["name"]: (door["address"], door["port"], door["source"], len(door["tickets"])) for door in doors} == {
         "alice": ("198.19.240.2", None, "", 1), "agent-1": ("198.19.240.3", 9091, "10.0.0.7/32", 0),
     }  # fmt: skip
     hosts = {host["name"]: host for host in rest.get("/v1/hosts").json["hosts"]}
-    assert {name: (one["address"], one["revoked"] is None) for name, one in hosts.items()} == {
+    assert {name: (host["address"], host["revoked"] is None) for name, host in hosts.items()} == {
         "robot2": ("10.78.0.2", True), "away": ("10.78.0.3", False), "robot3": ("10.78.0.4", True),
     }  # fmt: skip
     assert hosts["robot2"]["renewing"] and hosts["robot2"]["ports"]["open"] == [11_311, 40_001]

@@ -112,7 +112,7 @@ def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[d
 def test_every_file_belongs_to_a_part(engine: Engine, unpacked: Path) -> None:
     python = ("/opt/rosrv/bin/python", "-P", "-")
     assert [
-        one for one in run(engine, *python, text=NOBODYS).splitlines() if not EXPECTED.fullmatch(one)
+        line for line in run(engine, *python, text=NOBODYS).splitlines() if not EXPECTED.fullmatch(line)
     ] == []
     ours = "/opt/rosrv/lib/python3.11/site-packages"
     spy = f"touch /usr/bin/spy {ours}/spy.py; exec {' '.join(python)}"
@@ -131,7 +131,7 @@ def test_the_list_is_valid(unpacked: Path) -> None:
     names = [f"{name}.SNAPSHOT.schema.json" for name in ("bom-1.6", "spdx", "jsf-0.82")]
     schemas = {name: json.loads((folder / name).read_text()) for name in names}
     registry = jsonschema_rs.Registry(
-        [(f"http://cyclonedx.org/schema/{name}", one) for name, one in schemas.items()]
+        [(f"http://cyclonedx.org/schema/{name}", schema) for name, schema in schemas.items()]
     )
     validator = jsonschema_rs.Draft7Validator(schemas[names[0]], registry=registry)
     found = json.loads(next(unpacked.glob("*.cdx.json")).read_text())

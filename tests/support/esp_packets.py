@@ -28,8 +28,8 @@ def initiators_keys(charon: Process) -> EspKeys:
     lines = [str(event.get("text")) for event in charon.events]
     begin = max(number for number, line in enumerate(lines) if "encryption initiator key => 36 bytes" in line)
     dump = lines[begin + 1 : begin + 4]
-    found = [re.search(r"\[CHD\].*?\d+: ((?:[0-9A-F]{2} ?)+)", line) for line in dump]
-    key = b"".join(bytes.fromhex(one[1]) for one in found if one)
+    matches = [re.search(r"\[CHD\].*?\d+: ((?:[0-9A-F]{2} ?)+)", line) for line in dump]
+    key = b"".join(bytes.fromhex(match[1]) for match in matches if match)
     assert len(key) == 36, dump
     outbound = max(number for number, line in enumerate(lines) if "adding outbound ESP SA" in line)
     spi = next(one for line in lines[outbound:] if (one := re.search(r"SPI 0x([0-9a-f]{8}), src", line)))

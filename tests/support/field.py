@@ -173,8 +173,8 @@ class Impostor:
 
 def whole(message: bytes) -> bool:
     head, end, body = message.partition(b"\r\n\r\n")
-    found = re.search(rb"(?i)content-length: *(\d+)", head)
-    return bool(end) and found is not None and len(body) >= int(found[1])
+    match = re.search(rb"(?i)content-length: *(\d+)", head)
+    return bool(end) and match is not None and len(body) >= int(match[1])
 
 
 def answering(value: Any) -> Callable[[socket.socket, bytes], None]:

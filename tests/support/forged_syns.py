@@ -30,18 +30,18 @@ def send_syn(source: str, target: str, port: int, from_port: int = 40000) -> Non
 
 def syn_sources(wire: socket.socket) -> list[str]:
     wire.setblocking(False)
-    found: list[str] = []
+    sources: list[str] = []
     while True:
         try:
             packet, (_, _, kind, *_) = wire.recvfrom(2048)
         except BlockingIOError:
-            return found
+            return sources
         if kind == socket.PACKET_OUTGOING:
             continue
         start, protocol = (20, packet[9]) if packet[0] >> 4 == 4 else (40, packet[6])
         ends = packet[12:16] if start == 20 else packet[8:24]
         if protocol == _TCP and packet[start + 13] & _SYN_ACK_MASK == _SYN:
-            found.append(str(ipaddress.ip_address(ends)))
+            sources.append(str(ipaddress.ip_address(ends)))
 
 
 def flood_command(source: str, target: str, port: int, *, per_second: int, seconds: float) -> list[str]:

@@ -36,7 +36,7 @@ class Forking:
         return self.host.address
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        arguments = _of_python([str(one) for one in args], options["env"]["PATH"])
+        arguments = _of_python([str(arg) for arg in args], options["env"]["PATH"])
         if arguments is None or not isinstance(self.host, ThisMachine | lab.Host):
             return self.host.popen(args, **options)
         inside = self.host.namespace.path if isinstance(self.host, lab.Host) else _OWN_NAMESPACE

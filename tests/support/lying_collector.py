@@ -25,8 +25,8 @@ class Visitor:
         return head
 
     def body(self, head: bytes) -> bytes:
-        found = re.search(rb"Content-Length: (\d+)", head)
-        left, parts = int(found[1]) if found else 0, []
+        match = re.search(rb"Content-Length: (\d+)", head)
+        left, parts = int(match[1]) if match else 0, []
         while left and (part := self.stream.recv(left)):
             left -= len(part)
             parts.append(part)

@@ -61,7 +61,7 @@ class Kernel:
 
 
 def newest_kernel() -> Kernel:
-    found = [
+    kernels = [
         Kernel(release, image, initrd)
         for image in sorted(
             Path("/boot").glob("vmlinuz-*-cloud-amd64"), key=lambda path: path.stat().st_mtime
@@ -70,8 +70,8 @@ def newest_kernel() -> Kernel:
         and (initrd := image.with_name(f"initrd.img-{release}")).exists()
         and Path("/lib/modules", release).is_dir()
     ]
-    needs(found, f"a kernel for the virtual machine (Debian: sudo apt install {KERNEL})")
-    return found[-1]
+    needs(kernels, f"a kernel for the virtual machine (Debian: sudo apt install {KERNEL})")
+    return kernels[-1]
 
 
 def machine_disk(kernel: Kernel) -> Path:

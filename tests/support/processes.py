@@ -125,23 +125,23 @@ class Process:
     def wait_for_count(
         self, count: int, *, timeout: float = LIMIT, since: int = 0, **fields: Any
     ) -> list[Event]:
-        found: list[Event] = []
+        events: list[Event] = []
         position = since
         deadline = time.monotonic() + timeout
         with self._changed:
             while True:
                 for event in self.events[position:]:
                     if all(event.get(key) == value for key, value in fields.items()):
-                        found.append(event)
+                        events.append(event)
                         deadline = time.monotonic() + timeout
-                if len(found) >= count:
-                    return found[:count]
+                if len(events) >= count:
+                    return events[:count]
                 position = max(since, len(self.events))
                 left = deadline - time.monotonic()
                 if self._ended or left <= 0:
                     why = "ended" if self._ended else f"{timeout:.0f} s passed"
                     raise AssertionError(
-                        f"{len(found)} of {count} such events ({fields}): {why}\n{self.story()}"
+                        f"{len(events)} of {count} such events ({fields}): {why}\n{self.story()}"
                     )
                 self._changed.wait(left)
 

@@ -78,7 +78,7 @@ class ScriptHost:
         return ["nsenter", "-t", str(self._holder.pid), "-m", "-n", "-r", "--", *args]
 
     def popen(self, args: Sequence[Any], **options: Any) -> "subprocess.Popen[Any]":
-        return self.outer.popen(self.command([str(one) for one in args]), **options)
+        return self.outer.popen(self.command([str(arg) for arg in args]), **options)
 
     def run(
         self, *args: str, check: bool = True, timeout: float = 90, **environment: str

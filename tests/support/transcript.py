@@ -162,8 +162,8 @@ class Transcript:
 
     def _command(self, command: str) -> list[str]:
         self._fake.requests.clear()
-        found = _ROSRV.fullmatch(command)
-        done = self._bash(command) if found is None else self._rosrv(found[1], found[2])
+        match = _ROSRV.fullmatch(command)
+        done = self._bash(command) if match is None else self._rosrv(match[1], match[2])
         lines = [f"-> {request}" for request in self._fake.requests]
         lines += done.stdout.splitlines()
         lines += [f"2> {line}" for line in done.stderr.splitlines()]

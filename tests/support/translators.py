@@ -24,7 +24,7 @@ class Translator:
         if self.form == "nft":
             table = self.rules.split(" {")[0].removeprefix("table ")
             chains = self.rules.split("\n    chain ")[1:]
-            return f"nftables chain {table} {next(one.split()[0] for one in chains if 'masquerade' in one)}"
+            return f"nftables chain {table} {next(chain.split()[0] for chain in chains if 'masquerade' in chain)}"
         name = next(line.split()[1] for line in self.rules.splitlines() if "-j MASQUERADE" in line)
         return (
             f"iptables-legacy chain nat {name}" if "legacy" in self.form else f"nftables chain ip nat {name}"
@@ -219,13 +219,13 @@ def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -
     interfaces.create_bridge(machine, translator.interface)
     interfaces.add_address(machine, translator.interface, f"{translator.network}.1/24")
     interfaces.add_address(machine, translator.interface, "fd88::1/64")
-    found = plugged(machine, guest, translator.interface, translator.network)
+    host = plugged(machine, guest, translator.interface, translator.network)
     interfaces.add_address(guest, "eth0", "fd88::2/64")
     interfaces.add_route(guest, "default", "fd88::1")
     for family in ("ipv4", "ipv6"):
         machine.sysctl(f"net/{family}/conf/all/forwarding", "1")
     load(machine, translator.form, translator.rules)
-    return Host("guest", guest, "", (*found.interfaces, "fd88::2/64"))
+    return Host("guest", guest, "", (*host.interfaces, "fd88::2/64"))
 
 
 def plugged(machine: Namespace, guest: Namespace, bridge: str, network: str) -> Host:

@@ -146,5 +146,5 @@ class JoinedHost:
 
 
 def _established(event: Event) -> str | None:
-    found = re.search(r"IKE_SA rosrv\S*\[(\d+)\] established", str(event.get("text")))
-    return found and found[1]
+    match = re.search(r"IKE_SA rosrv\S*\[(\d+)\] established", str(event.get("text")))
+    return match and match[1]

@@ -94,7 +94,7 @@ def checkout(request: pytest.FixtureRequest) -> Iterator[Checkout]:
         shutil.rmtree(above)
 
 
-def clone(place: Path, way: Way) -> None:
+def clone(path: Path, way: Way) -> None:
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     files = subprocess.run(
         ["tar", "--null", "--files-from=-", "--create", "--mode=u+w,go+rX"],
@@ -105,21 +105,21 @@ def clone(place: Path, way: Way) -> None:
     ).stdout
     script = 'mkdir -p "$0" && tar --extract --no-same-permissions --no-same-owner --directory "$0"'
     given = {"user": way.owner, "group": way.owner, "umask": way.umask, "extra_groups": []}
-    subprocess.run(["sh", "-c", script, str(place)], input=files, check=True, cwd="/", **given)  # type: ignore[call-overload]  # the options depend on nothing
+    subprocess.run(["sh", "-c", script, str(path)], input=files, check=True, cwd="/", **given)  # type: ignore[call-overload]  # the options depend on nothing
 
 
-def share_packages(place: Path) -> None:
+def share_packages(path: Path) -> None:
     for module in (ROOT / "appliance/relay/transport").glob("pump*.so"):
-        shutil.copy(module, place / module.relative_to(ROOT))
-    command = ["/usr/bin/python3", "-m", "venv", "--without-pip", str(place / ".venv")]
+        shutil.copy(module, path / module.relative_to(ROOT))
+    command = ["/usr/bin/python3", "-m", "venv", "--without-pip", str(path / ".venv")]
     subprocess.run(command, check=True)
-    packages = place / ".venv" / PACKAGES
+    packages = path / ".venv" / PACKAGES
     for name in re.findall(r"^([a-z0-9.-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE):
         for file in distribution(name).files or ():
             if ".." not in file.parts:  # a program of the package
                 (packages / file).parent.mkdir(parents=True, exist_ok=True)
                 link_or_copy(ROOT / ".venv" / PACKAGES / file, packages / file)
-    (packages / "rosrv.pth").write_text(f"{place}\n")
+    (packages / "rosrv.pth").write_text(f"{path}\n")
 
 
 def link_or_copy(source: Path, target: Path) -> None:

@@ -137,7 +137,7 @@ def test_the_tests_of_the_cells_exist(entrance: str) -> None:
 
 def test_each_rule_of_each_entrance_is_taken_out_once() -> None:
     changes = [*entrances.taken_out()]
-    assert sorted((one.entrance, one.rule) for one in changes) == sorted(
+    assert sorted((change.entrance, change.rule) for change in changes) == sorted(
         (entrance, rule)
         for entrance, row in CELLS.items()
         for rule, cell in row.items()

@@ -132,7 +132,7 @@ def test_tests_that_the_assurance_names_are_there() -> None:
 
 def test_every_operation_of_rest_is_on_its_page() -> None:
     text = (ROOT / "docs" / "reference" / "rest.md").read_text()
-    paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", one.path) for one in OPERATIONS if one.path}
+    paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", operation.path) for operation in OPERATIONS if operation.path}
     missing = [path for path in paths if not re.search(rf"{path}(?![\w/])", text)]
     assert not missing, f"describe in docs/reference/rest.md: {', '.join(missing)}"
 

@@ -71,7 +71,7 @@ def test_it_says_what_it_is(wheel: Path) -> None:
     assert (says["Name"], says["Version"]) == ("rosrv-appliance", __version__)
     assert (says["License-Expression"], says["Requires-Python"]) == ("Apache-2.0", ">=3.11")
     assert says.get_payload() == (ROOT / "README.md").read_text()
-    assert {Requirement(one).name for one in says.get_all("Requires-Dist", [])} >= {one.name for one in RUNS}
+    assert {Requirement(one).name for one in says.get_all("Requires-Dist", [])} >= {run.name for run in RUNS}
 
 
 def test_it_brings_what_is_not_code(wheel: Path) -> None:

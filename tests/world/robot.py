@@ -73,5 +73,5 @@ class Robot:
         return f"ip saddr {address} drop" not in self._rules
 
     def translated(self, address: Address) -> Address | None:
-        found = re.search(r"dnat to (\S+)", self._rules)
-        return (found[1].rstrip(";"), address[1]) if found else None
+        match = re.search(r"dnat to (\S+)", self._rules)
+        return (match[1].rstrip(";"), address[1]) if match else None

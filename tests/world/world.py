@@ -571,14 +571,14 @@ class World:
         [policy], relay = self.possible, self.appliance.relay
         wanted = {
             key
-            for key, one in holders.items()
-            if one is not node and topic in one.publishes
-            if POLICIES[policy].may_publish(topic, one.host) and POLICIES[policy].may_use(topic, node.host)
+            for key, holder in holders.items()
+            if holder is not node and topic in holder.publishes
+            if POLICIES[policy].may_publish(topic, holder.host) and POLICIES[policy].may_use(topic, node.host)
         }
         whose = ("topic", topic, node.host, node.name)
         heard = {key for key, *rest in relay.connections if tuple(rest) == whose}
         told = {ports.get(subscription.ports.get(uri, 0), uri) for uri in subscription.known}
-        open_to_doubt = {key for key, one in holders.items() if one.superseded}
+        open_to_doubt = {key for key, holder in holders.items() if holder.superseded}
         wanted, heard, told = (keys - open_to_doubt for keys in (wanted, heard, told))
         if heard != wanted or told != wanted:
             raise BrokenPromiseError(f"{node} hears {heard} on {topic}, knows {told}, and may have {wanted}")

@@ -104,8 +104,8 @@ def _with_lasting_files(page: str, joined: Mapping[str, str], served: dict[str, 
     """Add the files that the page names, directly or not, under lasting addresses; return the page with those."""
     addresses: dict[str, str] = {}
 
-    def named(found: re.Match[str]) -> str:
-        name = found[1]
+    def named(match: re.Match[str]) -> str:
+        name = match[1]
         if name not in served:
             raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
         if name not in addresses:
@@ -157,17 +157,17 @@ def _parts(of_features: Mapping[str, tuple[ConsolePart, ...]]) -> str:
     return "".join([*imports, "export const PARTS = [", *rows, "];\n"])
 
 
-def _answer(request: Request, found: _File) -> Response:
-    packed = found.packed if _GZIP.search(request.headers.get("accept-encoding", "")) else None
-    etag = f'"{found.digest}{"-gzip" if packed else ""}"'
+def _answer(request: Request, file: _File) -> Response:
+    packed = file.packed if _GZIP.search(request.headers.get("accept-encoding", "")) else None
+    etag = f'"{file.digest}{"-gzip" if packed else ""}"'
     headers = {**HEADERS, "ETag": etag, "Vary": "Accept-Encoding"}
-    if found.lasting:
+    if file.lasting:
         headers["Cache-Control"] = "public, max-age=31536000, immutable"
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers=headers)
     if packed:
         headers["Content-Encoding"] = "gzip"
-    return Response(packed or found.body, headers=headers, media_type=found.media_type)
+    return Response(packed or file.body, headers=headers, media_type=file.media_type)
 
 
 def _collect(entries: Iterable[Traversable], prefix: str) -> dict[str, _File]:

@@ -154,13 +154,13 @@ class _Joining:
                 (i for i in range(at, len(tokens)) if tokens[i].text == ";" and tokens[i].outermost), at
             )
             statement = "".join(one.text for one in tokens[at - 1 : end + 1])
-            found = _FROM.fullmatch(statement)
-            if found is None:
+            match = _FROM.fullmatch(statement)
+            if match is None:
                 raise ModuleError(
                     f"{path}:{token.line}: unsupported in a module of the console: {statement[:80]}"
                 )
-            for name, renamed in self._names(path, found[1], token.line):
-                value = self._value(path, found[2], name, token.line)
+            for name, renamed in self._names(path, match[1], token.line):
+                value = self._value(path, match[2], name, token.line)
                 if token.text == "export":
                     exports[renamed] = value
                 else:
@@ -175,10 +175,10 @@ class _Joining:
 
     def _names(self, path: str, text: str, line: int) -> Iterator[tuple[str, str]]:
         for part in text.strip().rstrip(",").split(","):
-            found = _NAME.fullmatch(part.strip())
-            if found is None:
+            match = _NAME.fullmatch(part.strip())
+            if match is None:
                 raise ModuleError(f"{path}:{line}: unsupported list of names: {text.strip()}")
-            yield found[1], found[2] or found[1]
+            yield match[1], match[2] or match[1]
 
     def _value(self, path: str, address: str, name: str, line: int) -> str:
         if address.startswith("/"):
@@ -292,12 +292,12 @@ def _awaits_value(before: _Token) -> bool:
 
 def _next(text: str, at: int, *, in_template: bool, value_follows: bool) -> tuple[str, str] | None:
     if text[at] == "`" or in_template:
-        found = _TEMPLATE.match(text, at + 1)
-        return found and ("template", text[at : found.end()])
+        match = _TEMPLATE.match(text, at + 1)
+        return match and ("template", text[at : match.end()])
     if text[at] == "/" and value_follows and text[at + 1 : at + 2] not in ("/", "*"):
-        found = _REGULAR_EXPRESSION.match(text, at)
-        return found and ("text", found[0])
-    found = _TOKEN.match(text, at)
-    if found is None or (text.startswith("/*", at) and found.lastgroup != "space"):
+        match = _REGULAR_EXPRESSION.match(text, at)
+        return match and ("text", match[0])
+    match = _TOKEN.match(text, at)
+    if match is None or (text.startswith("/*", at) and match.lastgroup != "space"):
         return None
-    return str(found.lastgroup), found[0]
+    return str(match.lastgroup), match[0]

@@ -67,11 +67,11 @@ def without_contents(entry: LogEntry) -> LogEntry:
 
 def without_binding(text: str, detail: Mapping[str, object]) -> str:
     """Return the text without the values of parameters, which come from messages."""
-    found = _BOUND.search(text)
-    if found is None:
+    match = _BOUND.search(text)
+    if match is None:
         return text
-    category = f": {detail['category']}" if found[1].startswith("property") and "category" in detail else ""
-    return text[: found.end(1)] + category
+    category = f": {detail['category']}" if match[1].startswith("property") and "category" in detail else ""
+    return text[: match.end(1)] + category
 
 
 def as_object(entry: LogEntry) -> dict[str, Any]:

@@ -65,11 +65,11 @@ def plain_reason(record: AuditRecord) -> str:
     """Return the reason without its words about repetitions."""
     if "monitor" not in record.detail:
         return record.reason
-    found = _MORE.match(record.reason)
-    if found is None:
+    match = _MORE.match(record.reason)
+    if match is None:
         return record.reason
-    text = record.reason[found.end() :]
-    return (found[1] or "") + text if text else ""
+    text = record.reason[match.end() :]
+    return (match[1] or "") + text if text else ""
 
 
 def time_span(record: AuditRecord) -> tuple[int, int]:

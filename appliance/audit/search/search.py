@@ -68,13 +68,13 @@ def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | N
         if column == "sequence" and not (record_id.isascii() and record_id.isdecimal()):
             return None
         value = record_id if column == "id" else min(int(record_id[:19]), (1 << 63) - 1)
-        found = _fetch(connection, f"WHERE {column} = ? LIMIT 1", (value,))
-        if not found:
+        entries = _fetch(connection, f"WHERE {column} = ? LIMIT 1", (value,))
+        if not entries:
             return None
         return RecordInContext(
-            found[0],
-            _neighbours(connection, found[0], neighbours, newest_first=True)[::-1],
-            _neighbours(connection, found[0], neighbours, newest_first=False),
+            entries[0],
+            _neighbours(connection, entries[0], neighbours, newest_first=True)[::-1],
+            _neighbours(connection, entries[0], neighbours, newest_first=False),
         )
 
     return _reading(path, find)

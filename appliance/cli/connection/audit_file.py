@@ -96,10 +96,10 @@ class FileLog:
         with self._signer() as folder:
             return remembered_logs(folder, open_named)
 
-    def acknowledge(self, one: RememberedLog) -> None:
+    def acknowledge(self, log: RememberedLog) -> None:
         """Acknowledge, as root, that a log is no longer the present one, or that its memory is not whole."""
         with self._signer() as folder, acting_as(folder.stat().st_uid):  # in a container, root as the signer
-            acknowledge(folder, one, clock.wall_ns(), os.getuid())
+            acknowledge(folder, log, clock.wall_ns(), os.getuid())
 
     @contextmanager
     def _signer(self) -> Iterator[Path]:

@@ -49,7 +49,7 @@ def _programs(state: Path) -> Iterator[tuple[int, str]]:
         folder = _PROC / str(pid)
         try:
             words = os.fsdecode((folder / "cmdline").read_bytes()).split("\0")
-            ups = [Path(one).name == "rosrv" and two == "up" for one, two in itertools.pairwise(words)]
+            ups = [Path(word).name == "rosrv" and two == "up" for word, two in itertools.pairwise(words)]
             if any(ups) and (folder / "cwd").resolve() / _state_of(words, folder) == state.resolve():
                 yield pid, "loads its program and its configuration"
         except OSError:  # it has ended, or belongs to another user
@@ -57,7 +57,7 @@ def _programs(state: Path) -> Iterator[tuple[int, str]]:
 
 
 def _state_of(words: list[str], folder: Path) -> str:
-    given = [value for one, value in itertools.pairwise(words) if one == "--state"]
+    given = [value for word, value in itertools.pairwise(words) if word == "--state"]
     given += [word.partition("=")[2] for word in words if word.startswith("--state=")]
     environment = os.fsdecode((folder / "environ").read_bytes()).split("\0")
     given += [line.partition("=")[2] for line in environment if line.startswith("ROSRV_STATE=")]

@@ -107,9 +107,9 @@ def _topics(
 
 def topic_of(registry: Registry, relay: RelayControl, name: str) -> Topic:
     """Return a topic without its connections. Raises `UnknownThingError`."""
-    found = _topic(registry, relay, name, [])
-    if found.publishers or found.subscribers:
-        return found
+    topic = _topic(registry, relay, name, [])
+    if topic.publishers or topic.subscribers:
+        return topic
     names = {
         resource
         for kind, resource, holders in registry.resources()
@@ -155,12 +155,12 @@ def _services(relay: RelayControl, live: list[Incarnation], names: dict[str, str
 
 
 def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[str, list[Connection]]:
-    found: dict[str, list[Connection]] = {}
+    connections: dict[str, list[Connection]] = {}
     for connection in relay.carried.connections.values():
         if connection.kind == kind and connection.key in names:
             row = Connection(names[connection.key], connection.caller_id, connection.host)
-            found.setdefault(connection.resource, []).append(row)
-    return found
+            connections.setdefault(connection.resource, []).append(row)
+    return connections
 
 
 # Collect the measurements of control. The api formats them for Prometheus.

@@ -102,14 +102,14 @@ def _master(state: CheckedRobot) -> Iterator[CheckLine]:
             "stop", "master", f"{state.master} holds TCP {state.port}, and does not answer as a ROS master"
         )
         return
-    found = state.inventory
-    hosts = _some(filter(None, {node.host for node in found.nodes}))
+    inventory = state.inventory
+    hosts = _some(filter(None, {node.host for node in inventory.nodes}))
     numbers = ", ".join((
-        counted(len(found.nodes), "node"), counted(len(found.topics), "topic"),
-        counted(len(found.services), "service"), counted(len(found.parameters), "parameter"),
+        counted(len(inventory.nodes), "node"), counted(len(inventory.topics), "topic"),
+        counted(len(inventory.services), "service"), counted(len(inventory.parameters), "parameter"),
     ))  # fmt: skip
     yield CheckLine("ok", "master", f"{state.master}, {numbers}, hosts {hosts or 'none'}")
-    for left in found.left_out:
+    for left in inventory.left_out:
         yield CheckLine("warn", "master", f"not all of the graph was read: {left}")
 
 

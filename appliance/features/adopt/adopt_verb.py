@@ -228,12 +228,12 @@ def _show_report(report: TakeOverReport, *, as_json: bool) -> None:
     say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
 
 
-def _show_started(found: AdoptState, *, as_json: bool) -> None:
+def _show_started(state: AdoptState, *, as_json: bool) -> None:
     if as_json:
-        say_json(msgspec.to_builtins(found))
+        say_json(msgspec.to_builtins(state))
         return
-    say(f"adopted: {counted(found.nodes, 'node')} of {found.master}")
-    _show_left(found)
+    say(f"adopted: {counted(state.nodes, 'node')} of {state.master}")
+    _show_left(state)
     say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
 
 

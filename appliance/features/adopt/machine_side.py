@@ -128,7 +128,7 @@ class AdoptWork:
             own=[text.partition("/")[0] for text in interfaces.addresses(side.host)],
             master=master_of(side.host, _master_port(side)),
             reaches={port: one.master_address for port, one in found.items() if one.master_address},
-            sockets={port: sorted(one.listening) for port, one in found.items()},
+            sockets={port: sorted(socket.listening) for port, socket in found.items()},
             resolved=addresses_of(names, side.host.popen),
         )
         return dict(msgspec.to_builtins(facts))
@@ -142,8 +142,8 @@ class AdoptWork:
             return {}
         if wanted:
             self._require(take_order(self._state, ADOPT), "no operator ordered an adoption")
-            found = master_of(side.host, _master_port(side))
-            record = wanted_record(record, found)
+            master = master_of(side.host, _master_port(side))
+            record = wanted_record(record, master)
         else:
             may = self._may_undo or take_order(self._state, RELEASE)
             self._require(may, "no operator ordered a release")
@@ -226,9 +226,9 @@ class AdoptWork:
         master, appliance = _master_port(side), side.ends[4].appliance
         if any(port < FIRST_PORT or port == master for port in {*ports, *(one.port for one in remote)}):
             raise ValueError("a port of the machine itself is not a port of a node")
-        found = node_sockets(side.host, ports, master)
-        known = self._known_nodes(found.values())
-        others = {port: one.pid for port, one in found.items() if not is_node(one, known)}
+        sockets = node_sockets(side.host, ports, master)
+        known = self._known_nodes(sockets.values())
+        others = {port: socket.pid for port, socket in sockets.items() if not is_node(socket, known)}
         kept = {f"TCP {port}": f"process {pid}: {program_of(pid)}" for port, pid in sorted(others.items())}
         if not self._may_cut(phase, side.removed_at):
             return {"master": 0, "nodes": 0, "kept": kept}
@@ -236,13 +236,13 @@ class AdoptWork:
             log.warning("connections of processes that do not look like nodes are not cut", ports=kept)
         ports -= others.keys()
 
-        def of_master(one: TcpSocket) -> bool:
-            return one.port == master and one.peer_address != appliance
+        def of_master(socket: TcpSocket) -> bool:
+            return socket.port == master and socket.peer_address != appliance
 
-        def of_nodes(one: TcpSocket) -> bool:
-            if one.port in ports:
-                return one.peer_address != appliance
-            return (one.peer_address, one.peer_port) in remote
+        def of_nodes(socket: TcpSocket) -> bool:
+            if socket.port in ports:
+                return socket.peer_address != appliance
+            return (socket.peer_address, socket.peer_port) in remote
 
         calls = end_connections(side.host, of_master)
         threading.Event().wait(
@@ -291,30 +291,30 @@ class AdoptWork:
         self._require(load_record(self._state).phase is Phase.GIVEN, "the graph is not given back")
         ranges, robot = side.settings.ports, {ends.host for ends in side.ends.values()}
 
-        def of_nodes(one: TcpSocket) -> bool:
-            return any(span.first <= one.port <= span.last for span in ranges if span.first != span.last)
+        def of_nodes(socket: TcpSocket) -> bool:
+            return any(span.first <= socket.port <= span.last for span in ranges if span.first != span.last)
 
         ended = end_connections(side.namespace, of_nodes, lasting=_CALL_SECONDS)
         log.info("the graph is given back", connections=ended, robot=sorted(robot))
         return {"nodes": ended}
 
 
-def wanted_record(record: AdoptRecord, found: RobotMaster | None) -> AdoptRecord:
-    """Return the record of a wanted adoption of the graph of `found`. Raises `NetworkError` without a master.
+def wanted_record(record: AdoptRecord, master: RobotMaster | None) -> AdoptRecord:
+    """Return the record of a wanted adoption of the graph of `master`. Raises `NetworkError` without a master.
 
     Keep the recorded master if an adoption is already wanted, or if a stand-in has the graph.
     """
     if record.wanted:
         return record
-    if found is None:
+    if master is None:
         raise NetworkError("no ROS master of the robot is running: start the robot first")
     record = msgspec.structs.replace(
         record, wanted=True, since_utc=clock.utc_now().isoformat(timespec="seconds")
     )
-    if record.program and found.pid == record.stand_in:
+    if record.program and master.pid == record.stand_in:
         return record
     return msgspec.structs.replace(
-        record, unit=found.unit, user=found.user, program=found.program, group=found.group
+        record, unit=master.unit, user=master.user, program=master.program, group=master.group
     )
 
 

@@ -881,8 +881,8 @@ class AdoptOperation:
             if known.nodes.get(name) != uri and (name not in nodes or nodes[name].api_text != uri)
         ]
         shares = {name: self._share(nodes[name]) for name in names if name in nodes}
-        found = await serve_by_host(shares, is_newer, HostShare(_NEWER_SECONDS, _NEWER_SECONDS))
-        return {name for name in names if found.get(name, True)}
+        results = await serve_by_host(shares, is_newer, HostShare(_NEWER_SECONDS, _NEWER_SECONDS))
+        return {name for name in names if results.get(name, True)}
 
     @staticmethod
     def _moved(name: str, there: MasterGraph, held: Mapping[Entry, Incarnation]) -> bool:

@@ -68,19 +68,19 @@ def changes(known: dict[int, Approval], rows: Iterable[Approval]) -> Iterator[Ap
     yield from (msgspec.structs.replace(one, left_seconds=0.0) for one in left.values())
 
 
-def _announce(appliance: Appliance, one: Approval, line: Callable[[Approval], tuple[str, str]]) -> None:
-    waits = one.state == "waits" and one.left_seconds > 0
+def _announce(appliance: Appliance, approval: Approval, line: Callable[[Approval], tuple[str, str]]) -> None:
+    waits = approval.state == "waits" and approval.left_seconds > 0
     if appliance.as_json:
-        say_json(msgspec.structs.asdict(one))
+        say_json(msgspec.structs.asdict(approval))
         return
-    if not one.left_seconds:
-        say(f"{one.number}: has ended")
+    if not approval.left_seconds:
+        say(f"{approval.number}: has ended")
         return
     if waits and sys.stdout.isatty():
         sys.stdout.write(_BELL)
-    say(*line(one))
+    say(*line(approval))
     if waits:
-        say(f"    rosrv approve {one.number} --for 30s    rosrv approval refuse {one.number}")
+        say(f"    rosrv approve {approval.number} --for 30s    rosrv approval refuse {approval.number}")
 
 
 @speaks
@@ -139,11 +139,11 @@ def _list(appliance: Appliance) -> None:
         say("no call waits for an approval")
 
 
-def _say(appliance: Appliance, one: Approval) -> None:
+def _say(appliance: Appliance, approval: Approval) -> None:
     if appliance.as_json:
-        say_json(msgspec.structs.asdict(one))
+        say_json(msgspec.structs.asdict(approval))
     else:
-        line, style = _line(appliance, one)
+        line, style = _line(appliance, approval)
         say_row([line], style)
 
 
@@ -155,17 +155,17 @@ def _line(appliance: Appliance, one: Approval) -> tuple[str, str]:
     return f"{what}: {state}{who}, {one.left_seconds:g} s left", "yellow" if one.state == "waits" else ""
 
 
-def _arguments(one: Approval) -> str:
-    if not one.sha256:
-        return " with any arguments" if one.category == "call" else ""
-    if one.sha256 == WITHHELD:
-        return f" with {counted(one.size, 'byte')} of arguments, which viewers do not see"
-    data = bytes.fromhex(one.arguments)
-    fields, rest = _fields(one.type, data)
-    shown = f"{data!r} ({one.type}, sha256 {one.sha256[:12]})" if fields is None else str(fields)
+def _arguments(approval: Approval) -> str:
+    if not approval.sha256:
+        return " with any arguments" if approval.category == "call" else ""
+    if approval.sha256 == WITHHELD:
+        return f" with {counted(approval.size, 'byte')} of arguments, which viewers do not see"
+    data = bytes.fromhex(approval.arguments)
+    fields, rest = _fields(approval.type, data)
+    shown = f"{data!r} ({approval.type}, sha256 {approval.sha256[:12]})" if fields is None else str(fields)
     if rest:  # the service may read them, and the approval is for all bytes
         shown = f"{shown}, and {counted(len(rest), 'byte')} behind the last field: {read_bytes(rest)}"
-    hidden = one.size - len(data)
+    hidden = approval.size - len(data)
     return f" {shown}{f', and {hidden} more bytes, which are not shown' if hidden else ''}"
 
 

@@ -40,32 +40,32 @@ def summarise(
     """
     with Errors():
         begin, end = times_given(since, until)
-        found = audit_of(appliance.way).denials(Filter(since=begin, until=end), limit)
+        summary = audit_of(appliance.way).denials(Filter(since=begin, until=end), limit)
         if appliance.as_json:
-            say_json(found)
+            say_json(summary)
             return
-        for line in _lines(found, appliance.host_in_words):
+        for line in _lines(summary, appliance.host_in_words):
             write(printable(line))
 
 
-def _lines(found: DenialSummary, host_in_words: HostInWords) -> Iterator[str]:
-    if not found.hosts:
+def _lines(summary: DenialSummary, host_in_words: HostInWords) -> Iterator[str]:
+    if not summary.hosts:
         yield "no denials"
-    hosts = [host_in_words(row.host) for row in found.hosts]
+    hosts = [host_in_words(row.host) for row in summary.hosts]
     width = max(map(len, hosts), default=0)
-    for host, row in zip(hosts, found.hosts, strict=True):
+    for host, row in zip(hosts, summary.hosts, strict=True):
         yield f"{host:<{width}}  {counted(row.count, 'denial')}, {_span(row)}{_callers(row)}"
         for reason in row.reasons:
             yield f"{reason.count:>8}  {_cut(reason.name)}"
         if row.more_reasons:
             yield f"{'':>8}  and {counted(row.more_reasons, 'other reason')}"
-    if found.more_hosts:
+    if summary.more_hosts:
         yield (
-            f"and {counted(found.more_hosts, 'more host')} with {counted(found.more_denials, 'denial')}: --limit"
-            f" {min(LARGEST_SUMMARY, len(found.hosts) + found.more_hosts)}"
+            f"and {counted(summary.more_hosts, 'more host')} with {counted(summary.more_denials, 'denial')}: --limit"
+            f" {min(LARGEST_SUMMARY, len(summary.hosts) + summary.more_hosts)}"
         )
-    if found.counted_since is not None:
-        earlier = local_text(parse_date(found.counted_since), digits=0)
+    if summary.counted_since is not None:
+        earlier = local_text(parse_date(summary.counted_since), digits=0)
         yield f"earlier records were not counted, as there are too many: --until {earlier}"
 
 

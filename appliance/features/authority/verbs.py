@@ -101,25 +101,25 @@ def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
     _show(appliance, appliance.answer_or_exit(DriveAsk(group, host)))
 
 
-def _show(appliance: Appliance, one: GroupState) -> None:
+def _show(appliance: Appliance, state: GroupState) -> None:
     shown = appliance.host_in_words
-    if one.ranks:
-        since = "" if one.held_seconds is None else f" for {one.held_seconds:g} s"
-        why = " ".join(shown(word) if _is_address(word) else word for word in one.why.split(" "))
-        say_row([f"{one.group}: {one.standing}{since}: {why}"])
-        say_row([f"  rank: {' > '.join(one.ranks)}"])
-        _show_not_carried(shown, one)
+    if state.ranks:
+        since = "" if state.held_seconds is None else f" for {state.held_seconds:g} s"
+        why = " ".join(shown(word) if _is_address(word) else word for word in state.why.split(" "))
+        say_row([f"{state.group}: {state.standing}{since}: {why}"])
+        say_row([f"  rank: {' > '.join(state.ranks)}"])
+        _show_not_carried(shown, state)
         return
     held = (
-        f"held by {shown(one.holder)}, {one.left_seconds:g} s left without a message"
-        if one.holder
+        f"held by {shown(state.holder)}, {state.left_seconds:g} s left without a message"
+        if state.holder
         else "free"
     )
-    parts = [f"{one.group}: {held}"]
-    if one.waiting:
-        parts = [f"{parts[0]};", f"waiting: {', '.join(map(shown, one.waiting))}"]
+    parts = [f"{state.group}: {held}"]
+    if state.waiting:
+        parts = [f"{parts[0]};", f"waiting: {', '.join(map(shown, state.waiting))}"]
     say_row(parts, gap=" ")
-    _show_not_carried(shown, one)
+    _show_not_carried(shown, state)
 
 
 def _show_not_carried(shown: Callable[[str], str], group: GroupState) -> None:

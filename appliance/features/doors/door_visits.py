@@ -131,7 +131,7 @@ class DoorVisits:
             del self._visits[ticket]
 
     def forget(self, door: str) -> None:
-        self._visits = {ticket: one for ticket, one in self._visits.items() if one.row.door != door}
+        self._visits = {ticket: visit for ticket, visit in self._visits.items() if visit.row.door != door}
 
     def present(self, door: str) -> list[TicketRow]:
         return [visit.row for visit in self._visits.values() if visit.row.door == door and not visit.replaced]

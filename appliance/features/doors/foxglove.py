@@ -190,21 +190,21 @@ class Foxglove:
                 self._refuse(str(error))
         return requests
 
-    def _advertise_channel(self, one: FoxgloveChannel) -> DoorRequest:
-        if one.encoding not in _ENCODINGS:
-            raise _FoxgloveError(f"the encoding {quote(one.encoding)}; use {' or '.join(_ENCODINGS)}")
-        if one.id in self._channels:
-            raise _FoxgloveError(f"the channel {one.id} exists; unadvertise it first")
+    def _advertise_channel(self, channel: FoxgloveChannel) -> DoorRequest:
+        if channel.encoding not in _ENCODINGS:
+            raise _FoxgloveError(f"the encoding {quote(channel.encoding)}; use {' or '.join(_ENCODINGS)}")
+        if channel.id in self._channels:
+            raise _FoxgloveError(f"the channel {channel.id} exists; unadvertise it first")
         if len(self._channels) >= self._limits.channels:
             raise _FoxgloveError(
                 f"{len(self._channels)} channels of this client; at most {self._limits.channels}"
             )
         if reason := self.queue.memory.refusal_to_keep():
             raise _FoxgloveError(reason)
-        topic, kind = resolve(one.topic, self._node), one.schemaName.replace("/msg/", "/")
-        self._channels[one.id] = topic, one.encoding, kept_bytes(topic, kind)
+        topic, kind = resolve(channel.topic, self._node), channel.schemaName.replace("/msg/", "/")
+        self._channels[channel.id] = topic, channel.encoding, kept_bytes(topic, kind)
         self.queue.memory.keep(kept_bytes(topic, kind))
-        return AdvertiseTopic(topic, kind, reply_to=one.id)
+        return AdvertiseTopic(topic, kind, reply_to=channel.id)
 
     def _unadvertise(self, operation: FoxgloveUnadvertise) -> list[DoorRequest]:
         ended = [self._channels.pop(one) for one in operation.channelIds if one in self._channels]

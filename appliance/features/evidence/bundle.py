@@ -144,14 +144,14 @@ class _Bundle:
     def _find(self, log: sqlite3.Connection) -> None:
         self._id = log_id(log)
         _number, sealed = last_signed(log)
-        found = sequences_in_period(log, *self._span, upto=sealed, limit=MAX_RECORDS + 1)
-        self._runs = _runs(found)
-        if not found:
+        sequences = sequences_in_period(log, *self._span, upto=sealed, limit=MAX_RECORDS + 1)
+        self._runs = _runs(sequences)
+        if not sequences:
             raise BundleError(
                 "the log has no record in that period: give another one (rosrv audit search --since)",
                 "unknown",
             )
-        if len(found) > MAX_RECORDS:
+        if len(sequences) > MAX_RECORDS:
             raise BundleError(f"more than {MAX_RECORDS} records match: export a shorter period", "request")
         begin = self._runs[0][0]
         loads = {last_of(log, event, begin) for event in (_POLICY, _SPECIFICATIONS)}

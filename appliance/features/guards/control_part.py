@@ -151,9 +151,9 @@ class DriverChecks:
             await asyncio.sleep(1)
 
     def _on_report(self, event: MonitorEvent) -> None:
-        found = _LINE.search(event.text) if (event.kind, event.monitor) == ("log", NAME) else None
-        if found and self._under_way():
-            self._end(found["outcome"], float(found["seconds"]))
+        match = _LINE.search(event.text) if (event.kind, event.monitor) == ("log", NAME) else None
+        if match and self._under_way():
+            self._end(match["outcome"], float(match["seconds"]))
 
     def _end(self, outcome: str, seconds: float | None, why: str = "") -> None:
         self._ended.set()

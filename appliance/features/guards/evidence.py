@@ -319,8 +319,8 @@ class StoppingTime(NamedTuple):
 
 def tick_of(preset: Preset) -> int:
     """Return the period of the preset's tick in milliseconds, or 0 without one."""
-    found = _TICK.search(preset.text)
-    return int(found[1]) if found else 0
+    match = _TICK.search(preset.text)
+    return int(match[1]) if match else 0
 
 
 def stopping_time(preset: Preset, values: Mapping[str, str], relay: float) -> StoppingTime:

@@ -290,20 +290,20 @@ class GuardOrders:
                 edited = origin_of(guard.text) == "changed"
                 yield OlderGuard(name, guard.name, guard.version, present, edited)
 
-    def _note_bypass(self, found: BypassedGuard) -> None:
+    def _note_bypass(self, guard: BypassedGuard) -> None:
         self._trail.happened(
             "guard bypassed",
-            f"{found.node} takes {found.topic} from {', '.join(found.publishers)}, past its guards",
+            f"{guard.node} takes {guard.topic} from {', '.join(guard.publishers)}, past its guards",
             category="monitor",
-            resource=found.topic,
-            node=found.node,
-            host=found.host,
-            publishers=found.publishers,
+            resource=guard.topic,
+            node=guard.node,
+            host=guard.host,
+            publishers=guard.publishers,
         )
 
     async def guards(self, request: guard_requests.GuardsWanted) -> GuardList:
         rows = [self._row(name, preset) for name, preset in self._guards().items()]
-        presets = [preset_row(one) for one in PRESETS.values()] if request.presets else []
+        presets = [preset_row(preset) for preset in PRESETS.values()] if request.presets else []
         return GuardList(
             self._monitors.revision, self._monitors.tag, presets, rows,
             [*self._former().values(), *self.placement.elsewhere, *self.placement.inside],
@@ -470,9 +470,9 @@ class GuardOrders:
     def _guarded_commands(self) -> frozenset[str]:
         given = self._monitors.sources.topics
         return frozenset(
-            (topics_in(one.text) | given.get(name, {})).get("command", "")
-            for name, one in self._guards().items()
-            if one.name != "withhold"
+            (topics_in(guard.text) | given.get(name, {})).get("command", "")
+            for name, guard in self._guards().items()
+            if guard.name != "withhold"
         )
 
     def _guard(self, name: str) -> tuple[Preset, str]:

@@ -88,18 +88,18 @@ def _shown(parts: Sequence[str]) -> str:
 
 def changes(earlier: str, made: Manual) -> list[str]:
     """Return the lines that differ. Raises `NoManualError`."""
-    found = _FOUND.search(earlier)
-    if found is None:
+    match = _FOUND.search(earlier)
+    if match is None:
         raise NoManualError("it has no digest of a safety manual")
-    content = earlier[: found.start()]
+    content = earlier[: match.start()]
     before = hashlib.sha256(content.encode()).hexdigest()
     lines = [
         *difflib.unified_diff(
             content.splitlines(), made.content.splitlines(), before, made.digest, "", "", 1, ""
         )
     ]
-    if before != found[1]:
-        lines.insert(0, f"the earlier manual was edited: it names the digest {found[1]}")
+    if before != match[1]:
+        lines.insert(0, f"the earlier manual was edited: it names the digest {match[1]}")
     return lines
 
 

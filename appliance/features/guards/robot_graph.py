@@ -227,8 +227,8 @@ class RobotGraph:
     @cached_property
     def velocity_commands(self) -> list[TopicFacts]:
         """The topics by which drivers take velocities."""
-        found = [topic for topic in self.velocities if self.drivers(topic) and self.crosses(topic)]
-        return found[:MAX_COMMANDS]
+        velocities = [topic for topic in self.velocities if self.drivers(topic) and self.crosses(topic)]
+        return velocities[:MAX_COMMANDS]
 
     @cached_property
     def bases(self) -> list[TopicFacts]:
@@ -240,8 +240,8 @@ class RobotGraph:
 
     @cached_property
     def arms(self) -> list[TopicFacts]:
-        found = [topic for topic in self.topics if topic.type in TRAJECTORIES and self.crosses(topic)]
-        return [topic for topic in found if topic not in self.legs][:MAX_COMMANDS]
+        topics = [topic for topic in self.topics if topic.type in TRAJECTORIES and self.crosses(topic)]
+        return [topic for topic in topics if topic not in self.legs][:MAX_COMMANDS]
 
     @cached_property
     def legs(self) -> list[TopicFacts]:
@@ -407,12 +407,12 @@ class RobotGraph:
         measured = any(self.publishes(node, POSES) for node in drivers)
         return not measured and any(self.publishes(node, _JOINT_COMMANDS) for node in drivers)
 
-    def _same_robot(self, one: TopicFacts, other: TopicFacts) -> bool:
-        ours, theirs = self._parts(one.name)[:-1], self._parts(other.name)[:-1]
+    def _same_robot(self, facts: TopicFacts, other: TopicFacts) -> bool:
+        ours, theirs = self._parts(facts.name)[:-1], self._parts(other.name)[:-1]
         if ours == theirs:
-            return self._one_body(one, other, ours)
-        if self.ends(one).isdisjoint(self.ends(other)):
-            return one not in self.bases and bool(theirs) and ours[: len(theirs)] == theirs
+            return self._one_body(facts, other, ours)
+        if self.ends(facts).isdisjoint(self.ends(other)):
+            return facts not in self.bases and bool(theirs) and ours[: len(theirs)] == theirs
         apart = next((i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b), None)
         if apart is None:
             return True

@@ -65,19 +65,19 @@ def _say_guard(row: GuardRow) -> None:
         say(f"    {line}", "dim")
 
 
-def _say_values(found: MonitorReadout, meanings: dict[str, str]) -> None:
-    if found.age_seconds is None:
-        say(f"its present values are not known: {found.why_old}", "yellow")
+def _say_values(readout: MonitorReadout, meanings: dict[str, str]) -> None:
+    if readout.age_seconds is None:
+        say(f"its present values are not known: {readout.why_old}", "yellow")
         return
-    if found.why_old:
-        say(f"its values {found.age_seconds:.1f} s ago; {found.why_old}:", "yellow")
+    if readout.why_old:
+        say(f"its values {readout.age_seconds:.1f} s ago; {readout.why_old}:", "yellow")
     else:
         say("its present values:")
     table = table_of("    value", "", "meaning")
-    for name, value in found.values.items():
-        add_row(table, f"    {name}", _shown(value, found.now_seconds), meanings.get(name, ""))
+    for name, value in readout.values.items():
+        add_row(table, f"    {name}", _shown(value, readout.now_seconds), meanings.get(name, ""))
     say_table(table)
-    for event, past in found.ages.items():
+    for event, past in readout.ages.items():
         say(f"    {event}: {'never' if past is None else f'{past:.2f} s ago'}")
 
 

@@ -167,12 +167,12 @@ def _scans(appliance: Appliance, topics: Sequence[str]) -> tuple[Mapping[str, Sc
         return {}, "the flight recorder has no scan"
 
 
-def _permits(one: Suggestion, scans: Scans) -> Iterator[tuple[str, float | None]]:
+def _permits(suggestion: Suggestion, scans: Scans) -> Iterator[tuple[str, float | None]]:
     """Yield what the guard would permit with its own values (no name), and with each of the less safe ones."""
-    values = {**one.measured, **one.values}
-    yield "", permitted_velocity(one.preset, values, scans)
-    for name, value in WITHOUT[one.preset].items():
-        yield f"{name}={value}", permitted_velocity(one.preset, {**values, name: value}, scans)
+    values = {**suggestion.measured, **suggestion.values}
+    yield "", permitted_velocity(suggestion.preset, values, scans)
+    for name, value in WITHOUT[suggestion.preset].items():
+        yield f"{name}={value}", permitted_velocity(suggestion.preset, {**values, name: value}, scans)
 
 
 def _sentence(topic: str, permits: dict[str, float | None]) -> str:

@@ -340,9 +340,9 @@ class _Writer:
         Proposals count, and guards in use unless they are disabled or broken; with `now`, only guards in force.
         """
         guards = {
-            (one.preset, one.topics.get("command"))
-            for one in self._loaded
-            if (one.state in _IN_FORCE if now else one.state not in ("off", "broken"))
+            (host.preset, host.topics.get("command"))
+            for host in self._loaded
+            if (host.state in _IN_FORCE if now else host.state not in ("off", "broken"))
         } | {(one.preset, one.topics["command"]) for one in self.found if not now}
         bases, arms = self.graph.bases, [*self.graph.arm_velocities, *self.graph.arms]
         for commands, presets, what, help_ in (
@@ -542,7 +542,7 @@ class _Writer:
                 return
         source = topics.get("by") or topics.get("stop") or ""
         heard, most = topics.get("state", source), _MOST_PUBLISHERS.get(preset)
-        number = next((len(one.publishers) for one in self.graph.topics if one.name == heard), 0)
+        number = next((len(topic.publishers) for topic in self.graph.topics if topic.name == heard), 0)
         if most is not None and number > most:
             self._say(
                 f"{preset} of {command.name} is left out: {counted(number, 'node publishes', 'nodes publish')} {heard},"

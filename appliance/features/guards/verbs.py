@@ -437,15 +437,15 @@ def _runs(appliance: Appliance) -> bool:
 
 
 def _pairs(texts: list[str] | None, form: str) -> dict[str, str]:
-    found: dict[str, str] = {}
+    pairs: dict[str, str] = {}
     for text in texts or []:
         name, sign, value = text.partition("=")
         if not sign or not name or not value:
             raise GuardError(f"{text}: write {form}")
-        if name in found:
-            raise GuardError(f"{name} has two values, {found[name]} and {value}: give one")
-        found[name] = value
-    return found
+        if name in pairs:
+            raise GuardError(f"{name} has two values, {pairs[name]} and {value}: give one")
+        pairs[name] = value
+    return pairs
 
 
 def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str]:

@@ -49,9 +49,9 @@ def logs_of(own: Log, other: Path | None, verb: str) -> dict[str, Log]:
     partner = FileLog(other)
     if own.present() == partner.present():
         raise usage_error(f"{other}: the same log as that of --state; give the other appliance's", verb=verb)
-    found: dict[str, Log] = {_name_in(own) or "this appliance": own}
-    found[_name_in(partner) or "the other appliance"] = partner
-    return found
+    logs: dict[str, Log] = {_name_in(own) or "this appliance": own}
+    logs[_name_in(partner) or "the other appliance"] = partner
+    return logs
 
 
 def _name_in(log: FileLog) -> str:

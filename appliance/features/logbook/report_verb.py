@@ -204,14 +204,14 @@ def report_interventions(
         if after is not None:
             begin = _end_of(after)
         end = clock.wall_ns() if end is None else end
-        found = _report(appliance, begin, end, other)
+        report = _report(appliance, begin, end, other)
     if output is not None:
-        write_new(output, page(found, appliance.host_in_words), verb=_VERB)
+        write_new(output, page(report, appliance.host_in_words), verb=_VERB)
         sys.stderr.write(f"rosrv: written to {output}\n")
     if appliance.as_json:
-        say_json(found)
+        say_json(report)
     elif output is None:
-        for line in report_lines(found, appliance.host_in_words):
+        for line in report_lines(report, appliance.host_in_words):
             say(line)
 
 

@@ -50,19 +50,19 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
         named |= {name: Path(places[name]) for name in texts}
     texts = read_specifications(MONITOR, files)
     for path, text in texts.items():
-        found = _NOT_UTF_8.search(text)
-        if found is not None:
-            line = text.count("\n", 0, found.start()) + 1
-            column = found.start() - text.rfind("\n", 0, found.start())
+        match = _NOT_UTF_8.search(text)
+        if match is not None:
+            line = text.count("\n", 0, match.start()) + 1
+            column = match.start() - text.rfind("\n", 0, match.start())
             raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
     sent = {Path(path).name: text for path, text in texts.items()}
     forms = ((sent, FILE_NAME), (definitions, DEFINITION))
     for name, text, form in ((name, text, form) for found, form in forms for name, text in found.items()):
-        place = Position(str(named[name]), 1, 1)
+        position = Position(str(named[name]), 1, 1)
         if not re.fullmatch(form, name):
-            raise SpecificationError.at(place, f"{name} must be {shape_of(form)}: rename it")
+            raise SpecificationError.at(position, f"{name} must be {shape_of(form)}: rename it")
         if len(text) > LONGEST_TEXT:
-            raise SpecificationError.at(place, f"longer than {LONGEST_TEXT} characters: divide it")
+            raise SpecificationError.at(position, f"longer than {LONGEST_TEXT} characters: divide it")
     return Sources(sent, definitions, signatures_of(named))
 
 

@@ -84,7 +84,7 @@ def routes(services: Services) -> Routes:
             text=(loaded.files or {})[state.file],
             alphabet=found.events,
             properties=found.properties,
-            warnings=[one for one in findings_of(loaded.warnings) if one.file == state.file],
+            warnings=[finding for finding in findings_of(loaded.warnings) if finding.file == state.file],
             uses=found.uses,
             hold=found.hold,
         )
@@ -122,15 +122,15 @@ def routes(services: Services) -> Routes:
 
 
 def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> list[LogEntry]:
-    found: list[LogEntry] = []
+    entries: list[LogEntry] = []
     more: str | None = cursor
-    while len(found) < count:
+    while len(entries) < count:
         page = search(path, Filter(category="monitor", text=name), more, count)
-        found += [entry for entry in page.entries if _of(entry, name)]
+        entries += [entry for entry in page.entries if _of(entry, name)]
         more = page.cursor
         if more is None:
             break
-    return found[:count]
+    return entries[:count]
 
 
 def _of(entry: LogEntry, name: str) -> bool:

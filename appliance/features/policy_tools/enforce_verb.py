@@ -118,15 +118,15 @@ def enforce(
     policy = compiled_with(change.text, body.file, context_of(body))
     period = recorded_period(appliance, since)
     live = live_now(appliance)
-    found = _compare(policy, period, live)
-    _show(appliance, found, period, change)
+    comparison = _compare(policy, period, live)
+    _show(appliance, comparison, period, change)
     if output is not None:
         try:
             write_told(output, change.text.encode())
         except OSError as error:
             raise usage_error(f"cannot write {output}: {error.strerror}") from None
     if dry_run:
-        raise typer.Exit(1 if found.denied or found.ended else 0)
+        raise typer.Exit(1 if comparison.denied or comparison.ended else 0)
     if when_standing and not body.site_keys:
         stand_or_exit(appliance, within, "rosrv policy")
     _load(appliance, body, change, confirmed, written=output)

@@ -386,8 +386,8 @@ def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:
     return members if robot else own
 
 
-def _shown(place: Network) -> str:
-    return str(place.network_address) if place.num_addresses == 1 else str(place)
+def _shown(network: Network) -> str:
+    return str(network.network_address) if network.num_addresses == 1 else str(network)
 
 
 def _check(learned: LearnedPolicy, robot: list[Network], *, tests_wanted: bool) -> None:

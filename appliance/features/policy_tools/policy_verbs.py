@@ -165,7 +165,7 @@ def _say_times(policy: Policy, *, as_json: bool) -> None:
     now = clock.wall()
     for atom, time in policy.times.items():
         closed = policy.closed.get(atom)
-        next_change = min((one for one in changes_of({atom: time}, now) if one > now), default=None)
+        next_change = min((change for change in changes_of({atom: time}, now) if change > now), default=None)
         begins = closed is not None and next_change is not None and next_change != time.until
         ends = closed is None and next_change is not None
         if as_json:

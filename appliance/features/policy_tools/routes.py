@@ -309,24 +309,24 @@ def _case(case: CaseResult) -> Case:
     )
 
 
-def _explain(found: DecisionExplanation) -> Explained:
-    decision = found.decision
+def _explain(decision_explanation: DecisionExplanation) -> Explained:
+    decision = decision_explanation.decision
     return Explained(
-        **found.request.fields(),
+        **decision_explanation.request.fields(),
         decision=decision.verdict,
         rule=RuleText(**asdict(decision.rule)) if decision.rule else None,
         reason=decision.reason,
-        told=found.told,
-        through=list(found.through),
-        limit=found.limit,
-        carried=found.carried,
+        told=decision_explanation.told,
+        through=list(decision_explanation.through),
+        limit=decision_explanation.limit,
+        carried=decision_explanation.carried,
         lost=[
             LostRule(
                 rule=RuleText(**asdict(rule.rule)), would="allow" if rule.grants else "deny", why=rule.why
             )
-            for rule in found.lost
+            for rule in decision_explanation.lost
         ],
-        node=_explain(found.node) if found.node is not None else None,
-        command=_explain(found.command) if found.command is not None else None,
-        allowed=found.allowed,
+        node=_explain(decision_explanation.node) if decision_explanation.node is not None else None,
+        command=_explain(decision_explanation.command) if decision_explanation.command is not None else None,
+        allowed=decision_explanation.allowed,
     )

@@ -118,21 +118,21 @@ class BagReader:
             yield heapq.heappop(waiting)
 
     def before(
-        self, place: MessagePosition, connections: Collection[int], most: int
+        self, position: MessagePosition, connections: Collection[int], most: int
     ) -> list[tuple[MessagePosition, int]]:
         found: list[tuple[MessagePosition, int]] = []
         for chunk in sorted(self.chunks, key=lambda chunk: -chunk.last):
             if len(found) == most and chunk.last < found[-1][0].time:
                 break
-            if chunk.first <= place.time:
-                earlier = (entry for entry in self.places(chunk, connections) if entry[0] < place)
+            if chunk.first <= position.time:
+                earlier = (entry for entry in self.places(chunk, connections) if entry[0] < position)
                 found = heapq.nlargest(most, [*found, *earlier])
         return found[::-1]
 
-    def body(self, place: MessagePosition, most: int) -> tuple[int, bytes]:
-        self._file.seek(place.chunk)
+    def body(self, position: MessagePosition, most: int) -> tuple[int, bytes]:
+        self._file.seek(position.chunk)
         read_fields(self._file)
-        self._file.seek(4 + place.offset, 1)
+        self._file.seek(4 + position.offset, 1)
         read_fields(self._file)
         size = _U32.unpack(self._file.read(4))[0]
         return size, self._file.read(min(size, most))

@@ -209,7 +209,7 @@ class Recorder:
 
     def _new_triggers(self) -> list[tuple[Trigger, str]]:
         follower = self._follower or self._begin_to_follow()
-        found: list[tuple[Trigger, str]] = []
+        triggers: list[tuple[Trigger, str]] = []
         for _page in range(_PAGES):
             entries = follower.poll()
             if not entries:
@@ -221,8 +221,8 @@ class Recorder:
                 if "not_recorded" in record.detail:
                     self._on_missed(trigger, str(record.detail["not_recorded"]))
                 else:
-                    found.append((trigger, str(record.detail.get("recording", ""))))
-        return found
+                    triggers.append((trigger, str(record.detail.get("recording", ""))))
+        return triggers
 
     def _begin_to_follow(self) -> Follower:
         """Begin `before` seconds ago, because an earlier recorder may not have read the log to its end."""

@@ -163,11 +163,11 @@ class RingReader:
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None
 
-    def _runs(self, blocks: _Blocks, place: ReadPosition | None) -> Iterator[_Run]:
+    def _runs(self, blocks: _Blocks, position: ReadPosition | None) -> Iterator[_Run]:
         run: _Run | None = None
         broken = False
         for number in sorted(blocks):
-            if place is not None and number < place.number:
+            if position is not None and number < position.number:
                 continue
             block, row = blocks[number]
             part = self._copy(block, row)
@@ -178,7 +178,7 @@ class RingReader:
                 run = None
                 broken = True
             if part is not None and run is None:
-                broken = broken or number != (0 if place is None else place.number)
+                broken = broken or number != (0 if position is None else position.number)
                 if broken and row.begins == NONE_BEGINS:
                     continue  # the middle of a record whose start is missing
                 run = _Run(number, row.begins, bytearray(), broken)
@@ -340,17 +340,17 @@ class RecordingInProgress:
         new.write_bytes(msgspec.msgpack.encode(progress))
         new.replace(self._folder / PROGRESS)
 
-    def _take(self, found: StreamFrames, following: dict[int, int]) -> None:
-        progress, header = self.progress, found.header
+    def _take(self, frames: StreamFrames, following: dict[int, int]) -> None:
+        progress, header = self.progress, frames.header
         if LEFT_OUT in header:
-            self._leave_out(header, seen=bool(found.batches))
+            self._leave_out(header, seen=bool(frames.batches))
             return
-        if found.torn and found.stream not in following and header["topic"] not in progress.torn:
+        if frames.torn and frames.stream not in following and header["topic"] not in progress.torn:
             progress.torn.append(header["topic"])
-        if not found.batches:
+        if not frames.batches:
             return
         heads = {
-            batch.carried: header if batch.carried else header | {CARRIED: "0"} for batch in found.batches
+            batch.carried: header if batch.carried else header | {CARRIED: "0"} for batch in frames.batches
         }
         fitting = {
             carried: head
@@ -358,7 +358,7 @@ class RecordingInProgress:
             if _key(head) in self._numbers or self._headers + connection_size(head) <= _MAX_HEADERS
         }
         if not fitting:
-            progress.unconnected += sum(len(batch.frames) for batch in found.batches)
+            progress.unconnected += sum(len(batch.frames) for batch in frames.batches)
             return
         row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
         if row is None:
@@ -366,10 +366,10 @@ class RecordingInProgress:
             progress.topics.append(row)
         waiting: list[BagMessage] = []
         size = empty = chunk_size(header)
-        for batch in found.batches:
-            gap = max(0, batch.first - following.get(found.stream, batch.first))
+        for batch in frames.batches:
+            gap = max(0, batch.first - following.get(frames.stream, batch.first))
             row.missed = min(row.missed + gap, MAX_MESSAGES)
-            following[found.stream] = batch.first + len(batch.frames)
+            following[frames.stream] = batch.first + len(batch.frames)
             if batch.carried not in fitting:
                 progress.unconnected += len(batch.frames)
                 continue

@@ -297,7 +297,7 @@ def _place_of_record(
     A monitor's record has the time of its message. Messages that were received together also have the same time, so
     their first bytes are compared as well.
     """
-    said = next((found for found in _records(reader) if found.id == record), None)
+    said = next((audit_record for audit_record in _records(reader) if audit_record.id == record), None)
     if said is None:
         times = [trigger.time for trigger in recording.triggers if trigger.record == record]
         if not times:

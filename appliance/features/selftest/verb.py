@@ -53,19 +53,19 @@ def selftest(
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for found in _all(appliance, config):
-        failed += found.outcome == "fail"
-        warned += found.outcome == "warn"
+    for finding in _all(appliance, config):
+        failed += finding.outcome == "fail"
+        warned += finding.outcome == "warn"
         if appliance.as_json:
-            say_json(asdict(found))
+            say_json(asdict(finding))
             sys.stdout.flush()
         else:
-            text = Text(printable(found.text))
-            if found.advice:
+            text = Text(printable(finding.text))
+            if finding.advice:
                 text.append(
-                    f"\n-> {printable(found.advice)}", style="bold" if found.outcome == "fail" else "dim"
+                    f"\n-> {printable(finding.advice)}", style="bold" if finding.outcome == "fail" else "dim"
                 )
-            table.add_row(Text(found.outcome, style=_STYLES[found.outcome]), found.check, text)
+            table.add_row(Text(finding.outcome, style=_STYLES[finding.outcome]), finding.check, text)
     if not appliance.as_json:
         say_table(table)
         end = f"{failed} failed, {counted(warned, 'warning')}" if failed else counted(warned, "warning")

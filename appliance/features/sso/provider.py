@@ -58,12 +58,12 @@ class Provider:
             failure = self._failure
             if failure is None or clock.now() - failure[0] >= _AGAIN_SECONDS:
                 try:
-                    found = await self._discover()
+                    endpoints = await self._discover()
                 except ProviderError as error:
                     failure = self._failure = clock.now(), str(error)
                 else:
-                    self._endpoints, self._failure = (clock.now(), found), None
-                    return found
+                    self._endpoints, self._failure = (clock.now(), endpoints), None
+                    return endpoints
             if known is None or clock.now() - known[0] >= self._keys_seconds:
                 raise ProviderError(failure[1])
             return known[1]

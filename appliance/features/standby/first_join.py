@@ -156,10 +156,10 @@ def make_kits(plan: PairPlan) -> Kits:
         "state": f"{_STATE}/lease-{secrets.token_hex(4)}",
     }
     appliances = {name: {"address": address} for name, address in addresses.items()}
-    with_keys = {name: one | {"key": keys[name]} for name, one in appliances.items()}
+    with_keys = {name: appliance | {"key": keys[name]} for name, appliance in appliances.items()}
     settings = {"witness": common | {"appliances": with_keys, "followers": followers}}
-    for name, one in followers.items():
-        own = {"appliances": appliances, "followers": {name: one}, "follows_as": name}
+    for name, follower in followers.items():
+        own = {"appliances": appliances, "followers": {name: follower}, "follows_as": name}
         settings[f"follower-{name}"] = common | own
     return Kits(
         membership(plan.name, plan.other),
@@ -387,13 +387,13 @@ def _free_of(taken: Iterable[int]) -> Iterator[str]:
 
 
 def _followers(texts: tuple[str, ...]) -> dict[str, str]:
-    found: dict[str, str] = {}
+    followers: dict[str, str] = {}
     for text in texts:
         name, separator, address = text.partition("=")
-        if not separator or name in found:
+        if not separator or name in followers:
             raise usage_error(f"--follower {text!r}: write NAME=ADDRESS, each name once", _VERB)
-        found[name] = address
-    return found
+        followers[name] = address
+    return followers
 
 
 def _write_kits(kits: Kits, out: Path) -> None:

@@ -199,8 +199,8 @@ def state_of(
         troubles=[],
         not_serving=lease.fault if lease is not None else "",
     )
-    found = takeover_obstacles(state, lease.takeover_obstacle if lease is not None else "")
-    return msgspec.structs.replace(state, troubles=found)
+    obstacles = takeover_obstacles(state, lease.takeover_obstacle if lease is not None else "")
+    return msgspec.structs.replace(state, troubles=obstacles)
 
 
 def host_endpoint(settings: Settings, membership: Membership) -> str:

@@ -257,11 +257,11 @@ class _Walk:
         for sequence in sorted(log.unreadable):
             message = f"record {sequence} of log {name} does not have the detail of its event"
             self._find(TakeoverFindingKind.UNREADABLE, 0, message)
-        for one, following in pairwise(log.takeovers):
-            if following.epoch <= one.epoch:
+        for takeover, following in pairwise(log.takeovers):
+            if following.epoch <= takeover.epoch:
                 message = (
-                    f"record {following.sequence} of log {name} comes after epoch {one.epoch},"
-                    f" record {one.sequence}"
+                    f"record {following.sequence} of log {name} comes after epoch {takeover.epoch},"
+                    f" record {takeover.sequence}"
                 )
                 self._find(TakeoverFindingKind.EPOCH_ORDER, following.epoch, message)
         for sequence, time, handed in log.handovers:
@@ -282,56 +282,56 @@ class _Walk:
                 )
                 self._find(TakeoverFindingKind.OVERLAP, handed.epoch, message)
 
-    def _check_names(self, one: _Takeover) -> None:
-        detail, other = one.detail, one.log.other
+    def _check_names(self, takeover: _Takeover) -> None:
+        detail, other = takeover.detail, takeover.log.other
         if detail.appliance in other.names or (other.names and detail.other not in other.names):
             message = (
                 f"{detail.appliance} took over from {detail.other}, but the other log is of"
                 f" {', '.join(sorted(other.names))}"
             )
-            self._find(TakeoverFindingKind.WRONG_NAME, one.epoch, message)
+            self._find(TakeoverFindingKind.WRONG_NAME, takeover.epoch, message)
         previous = detail.previous
         if previous is None:
             return
-        log = one.log if previous.appliance == detail.appliance else other
-        if previous.epoch >= one.epoch:
+        log = takeover.log if previous.appliance == detail.appliance else other
+        if previous.epoch >= takeover.epoch:
             message = f"it names epoch {previous.epoch} as the one before it"
-            self._find(TakeoverFindingKind.EPOCH_ORDER, one.epoch, message)
+            self._find(TakeoverFindingKind.EPOCH_ORDER, takeover.epoch, message)
         elif previous.epoch not in log.epochs and not (
             log.result.removed and previous.epoch < min(log.epochs, default=previous.epoch + 1)
         ):
             message = (
-                f"{previous.appliance} took over in this epoch, as the takeover of epoch {one.epoch} names it; log"
+                f"{previous.appliance} took over in this epoch, as the takeover of epoch {takeover.epoch} names it; log"
                 f" {log.result.log} does not have the record: it was removed, or the copy is older"
             )
             self._find(TakeoverFindingKind.TAKEOVER_MISSING, previous.epoch, message)
 
-    def _link(self, one: _Takeover) -> Link:
-        named, other = one.detail.checkpoint, one.log.other
+    def _link(self, takeover: _Takeover) -> Link:
+        named, other = takeover.detail.checkpoint, takeover.log.other
         if named is None:
             return "none"
         sealed, fault = other.before(named.sequence + 1), named.fault_in(other.known)
         if fault is not None:
             kind, words = _WRONG[fault]
-        elif sealed is not None and sealed.epoch > one.epoch:
+        elif sealed is not None and sealed.epoch > takeover.epoch:
             kind, words = TakeoverFindingKind.EPOCH_ORDER, _LATER_EPOCH
         else:
             return "removed" if named.sequence <= other.result.removed else "proven"
         words = words.format(named=named, log=other.known, sealed=sealed)
-        message = f"{one.detail.appliance} took over and named checkpoint {named.number}{words}"
-        self._find(kind, one.epoch, message)
+        message = f"{takeover.detail.appliance} took over and named checkpoint {named.number}{words}"
+        self._find(kind, takeover.epoch, message)
         return "wrong"
 
-    def _proof(self, one: _Takeover, overlap: Overlap) -> TakeoverProof:
-        detail, other, link = one.detail, one.log.other, self._link(one)
+    def _proof(self, takeover: _Takeover, overlap: Overlap) -> TakeoverProof:
+        detail, other, link = takeover.detail, takeover.log.other, self._link(takeover)
         through = tail = signed = 0
         if link in ("proven", "removed") and detail.checkpoint is not None:
             through = detail.checkpoint.sequence
-            end = other.end_of(through, one.epoch)
+            end = other.end_of(through, takeover.epoch)
             tail, signed = end - through, max(0, min(end, other.result.signed_through) - through)
         return TakeoverProof(
-            epoch=one.epoch, appliance=detail.appliance, other=detail.other, log=one.log.result.log,
-            sequence=one.sequence, time=one.time, link=link, through=through, tail=tail, tail_signed=signed,
+            epoch=takeover.epoch, appliance=detail.appliance, other=detail.other, log=takeover.log.result.log,
+            sequence=takeover.sequence, time=takeover.time, link=link, through=through, tail=tail, tail_signed=signed,
             overlap=overlap,
         )  # fmt: skip
 

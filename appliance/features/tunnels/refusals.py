@@ -67,10 +67,10 @@ class RefusalParser:
         self._packets: dict[str, _Packet] = {}  # by worker thread; charon has 16 threads
 
     def read(self, line: str) -> Refusal | None:
-        found = _LINE.match(line)
-        if found is None:
+        match = _LINE.match(line)
+        if match is None:
             return None
-        thread, text = found[1], found[2]
+        thread, text = match[1], match[2]
         if line[2:7] == "[ESP]":
             return _packet(text)
         arrived = _ARRIVED.match(text)
@@ -123,12 +123,12 @@ class RefusalShares:
 
     def rest(self) -> list[Refusal]:
         """Return what did not pass since the last call, a refusal for each source; the last may have none."""
-        found = [
+        refusals = [
             Refusal(remote, f"{count} more {'request was' if count == 1 else 'requests were'} refused")
             for remote, count in self._rest.items()
         ]
         self._rest.clear()
-        return found
+        return refusals
 
 
 def _packet(text: str) -> Refusal | None:

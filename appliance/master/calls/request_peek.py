@@ -65,5 +65,5 @@ def _parts(params: tuple[Value, ...]) -> str:
 
 
 def method_named(body: bytes) -> str:
-    found = _METHOD.search(body, 0, _BEGINNING)
-    return "" if found is None else found[1].decode("utf-8", "replace")
+    match = _METHOD.search(body, 0, _BEGINNING)
+    return "" if match is None else match[1].decode("utf-8", "replace")

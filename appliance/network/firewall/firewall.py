@@ -65,8 +65,8 @@ class Firewall:
         with self._turn:
             if self._backend is None:
                 return []
-            found = statuses(self._rules, self._backend.counters(), self._backend.families)
-            missing = [rule.purpose for rule in found if not rule.in_force]
+            rules = statuses(self._rules, self._backend.counters(), self._backend.families)
+            missing = [rule.purpose for rule in rules if not rule.in_force]
             if missing:
                 with installing_again():
                     self._backend.install(self._rules)

@@ -175,13 +175,13 @@ class PacketRule:
     def is_tcp(self) -> bool:
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
-    def refuses(self, one: TcpSocket, *, accepted: bool, near: bool) -> bool:
+    def refuses(self, socket: TcpSocket, *, accepted: bool, near: bool) -> bool:
         """Return whether it keeps such a connection from beginning, though perhaps an earlier rule permits it.
 
         `accepted`: this end did not open it. `near`: the other end is also on this machine.
         """
         interface = self.arrives_on or self.leaves_on
-        here, there = (one.local_address, one.port), (one.peer_address, one.peer_port)
+        here, there = (socket.local_address, socket.port), (socket.peer_address, socket.peer_port)
         source, destination = (there, here) if self.chain is Chain.IN else (here, there)
         return (
             self.verdict in (PacketVerdict.RESET, PacketVerdict.DROP)
@@ -193,7 +193,7 @@ class PacketRule:
             and (self.destination is None or _is_in(destination[0], self.destination))
             and (self.from_ports is None or source[1] in self.from_ports)
             and (self.tcp_ports is None or destination[1] in self.tcp_ports)
-            and self.uid in (None, one.uid)
+            and self.uid in (None, socket.uid)
         )
 
     def families(self) -> tuple[Family, ...]:

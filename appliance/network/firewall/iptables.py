@@ -94,9 +94,9 @@ class IptablesBackend:
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([], self._chains))
 
     def counters(self) -> tuple[RuleCounter, ...]:
-        found: list[RuleCounter] = []
-        self._in_tables(lambda table: found.extend(table.counters(self._chains)))
-        return tuple(found)
+        counters: list[RuleCounter] = []
+        self._in_tables(lambda table: counters.extend(table.counters(self._chains)))
+        return tuple(counters)
 
     def _in_tables(self, work: "Callable[[_Table], None]") -> None:
         def inside() -> None:

@@ -334,7 +334,7 @@ def _translates_source(rule: Json) -> bool:
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
     shared = {_key(counter): counter for counter in map(_counter, rules) if counter.purpose.endswith(_SHARED)}
-    found = []
+    counters = []
     for rule in rules:
         counter = _counter(rule)
         if any("set" in part for part in rule["expr"]):
@@ -344,8 +344,8 @@ def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
             packets, octets = counter.packets + behind.packets, counter.octets + behind.octets
             counter = replace(counter, packets=packets, octets=octets)
         if _key(counter) not in shared:
-            found.append(counter)
-    return tuple(found)
+            counters.append(counter)
+    return tuple(counters)
 
 
 def _key(counter: RuleCounter) -> tuple[str, Family | None, str]:

@@ -36,19 +36,19 @@ class RuleWatch:
 
     def changes(self) -> list[str]:
         """Return the program of each transaction since the last call that changed one of the tables."""
-        found: list[str] = []
+        changes: list[str] = []
         while True:
             try:
                 data = self._socket.recv(_MAX_BYTES)
             except BlockingIOError:
-                return found
+                return changes
             except OSError as error:
                 if error.errno != errno.ENOBUFS:
                     raise
                 self._touched = False
-                found.append("")  # reports were lost
+                changes.append("")  # reports were lost
             else:
-                found += self._read(data)
+                changes += self._read(data)
 
     def close(self) -> None:
         self._socket.close()

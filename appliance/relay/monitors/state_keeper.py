@@ -103,29 +103,29 @@ class StateKeeper:
     # --- state that an earlier process left ---
 
     def recover(self) -> RecoveredState | None:
-        found = RecoveredState()
-        heads = sorted(self._readable(found), key=lambda each: each[0].written)
+        state = RecoveredState()
+        heads = sorted(self._readable(state), key=lambda each: each[0].written)
         for head, sections in heads:
             reason = self._distrust(head)
             if head.lost:
-                found.lost[""] = head.lost
+                state.lost[""] = head.lost
             lost = msgspec.msgpack.encode(reason), None  # replaces the groups' states in older memories
             for group, section in zip(head.groups, sections, strict=False):
-                found.groups.append((group.monitors, bytes(group.cells), *(lost if reason else section)))
-        return found if heads or found.lost else None
+                state.groups.append((group.monitors, bytes(group.cells), *(lost if reason else section)))
+        return state if heads or state.lost else None
 
     def kept_shift(self) -> int:
         heads = [head for head, _sections in self._readable(RecoveredState())]
         return max(heads, key=lambda head: head.written).shift - self.shift if heads else 0
 
-    def _readable(self, found: RecoveredState) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:
+    def _readable(self, state: RecoveredState) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:
         for memory in self._left:
             try:
                 kept = read(memory)
                 if kept is not None:
                     yield _HEADS.decode(kept.head), kept.sections
             except ValueError as error:
-                found.lost[""] = f"{_UNREADABLE}: {error}"
+                state.lost[""] = f"{_UNREADABLE}: {error}"
 
     def _distrust(self, head: _Head) -> str:
         given = self._given
@@ -292,23 +292,23 @@ def start_outcome(
 
 
 def received_states(contents: Sequence[bytes]) -> RecoveredState:
-    found = RecoveredState()
-    for kept, head in _left(contents, found):
+    state = RecoveredState()
+    for kept, head in _left(contents, state):
         if head.lost:
-            found.lost[""] = head.lost
+            state.lost[""] = head.lost
             continue
         for group, section in zip(head.groups, kept.sections, strict=False):
-            found.groups.append((group.monitors, bytes(group.cells), *section))
-    return found
+            state.groups.append((group.monitors, bytes(group.cells), *section))
+    return state
 
 
-def _left(contents: Sequence[bytes], found: RecoveredState) -> Iterator[tuple[StoredState, _Head]]:
+def _left(contents: Sequence[bytes], state: RecoveredState) -> Iterator[tuple[StoredState, _Head]]:
     for content in filter(None, contents):
         try:
             kept = _CONTENTS.decode(content)
             head = _HEADS.decode(kept.head)
         except ValueError as error:
-            found.lost[""] = f"{_UNREADABLE}: {error}"
+            state.lost[""] = f"{_UNREADABLE}: {error}"
         else:
             yield kept, head
 

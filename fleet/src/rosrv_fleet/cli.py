@@ -178,16 +178,16 @@ def list_robots(config: Config = DEFAULT_CONFIG, *, as_json: Json = False) -> No
     robots, _invitations = _robots(config)
     presence = RobotPresence(robots.folder.parent / "heard")
     for robot in robots.known().values():
-        for name, one in robot.appliances.items():
+        for name, appliance in robot.appliances.items():
             sign = presence.last(robot.name, name)
             fields: dict[str, str | None] = {
                 "name": robot.name,
                 "state": "enrolled" if name in robot.connecting else "removed",
                 "group": robot.group,
-                "key": one.key,
-                "certificate": one.fingerprint,
+                "key": appliance.key,
+                "certificate": appliance.fingerprint,
                 "heard": _utc(sign and sign.at),
-                "certificate_ends": _utc(one.certificate_ends),
+                "certificate_ends": _utc(appliance.certificate_ends),
                 "appliance": name,
             }
             typer.echo(json.dumps(fields) if as_json else _robot_line(robot, fields))

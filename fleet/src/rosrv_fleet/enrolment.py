@@ -91,7 +91,7 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     def connecting(self) -> dict[str, RobotAppliance]:
         if self.removed is not None:
             return {}
-        return {name: one for name, one in self.appliances.items() if one.removed is None}
+        return {name: appliance for name, appliance in self.appliances.items() if appliance.removed is None}
 
     @property
     def public_keys(self) -> frozenset[bytes]:

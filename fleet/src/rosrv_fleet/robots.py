@@ -166,7 +166,7 @@ class Robots:
         self._connecting = {
             one.fingerprint: robot for robot in robots.values() for one in robot.connecting.values()
         }
-        self._since = {one: self._since.get(one, clock.now()) for one in self._connecting}
+        self._since = {robot: self._since.get(robot, clock.now()) for robot in self._connecting}
         self._robots, self.unreadable = robots, unreadable
 
     def accepted_since(self, fingerprint: str) -> float:

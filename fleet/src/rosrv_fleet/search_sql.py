@@ -93,12 +93,12 @@ def days_statement(record: Filter) -> SearchStatement | None:
     """Return the query for the days that a time range covers, or None without a range."""
     if record.since is None and record.until is None:
         return None
-    found = _Conditions()
+    conditions = _Conditions()
     if record.since is not None:
-        found.add("last_time >= %s", record.since)
+        conditions.add("last_time >= %s", record.since)
     if record.until is not None:
-        found.add("first_time < %s", record.until)
-    return found.statement("SELECT DISTINCT day FROM segment", "")
+        conditions.add("first_time < %s", record.until)
+    return conditions.statement("SELECT DISTINCT day FROM segment", "")
 
 
 def search_statement(
@@ -139,20 +139,20 @@ def search_statement(
 
 def records_statement(events: Collection[str], robot: str | None) -> SearchStatement:
     """Return the query for all records of some events, in the order of each robot's logs. Raise `FilterError`."""
-    found = _Conditions()
-    found.add("event = ANY(%s)", list(events))
-    found.matching("robot", "robot = %s", "robot ~ %s", robot)
-    return found.statement(_HEAD, " ORDER BY robot, log, sequence")
+    conditions = _Conditions()
+    conditions.add("event = ANY(%s)", list(events))
+    conditions.matching("robot", "robot = %s", "robot ~ %s", robot)
+    return conditions.statement(_HEAD, " ORDER BY robot, log, sequence")
 
 
 def logs_statement(robot: str | None) -> SearchStatement:
     """Return the query for all logs: robot, log, last record, times, and first record. Raise `FilterError`."""
-    found = _Conditions()
-    found.matching("robot", "robot = %s", "robot ~ %s", robot)
+    conditions = _Conditions()
+    conditions.matching("robot", "robot = %s", "robot ~ %s", robot)
     head: LiteralString = (
         "SELECT robot, log, max(last), min(first_time), min(first), max(last_time) FROM segment"
     )
-    return found.statement(head, " GROUP BY robot, log ORDER BY robot, log")
+    return conditions.statement(head, " GROUP BY robot, log ORDER BY robot, log")
 
 
 def _escape(text: str) -> str:

@@ -274,11 +274,11 @@ class SegmentStore:
     def newest(self, robot: str) -> tuple[int, SegmentPlace] | None:
         try:
             with (self._folder / "newest" / robot).open(encoding="ascii", errors="replace") as file:
-                found = _MARK.fullmatch(file.read())
+                match = _MARK.fullmatch(file.read())
                 arrived = os.fstat(file.fileno()).st_mtime_ns
         except FileNotFoundError:
             return None
-        return None if found is None else (arrived, _place(robot, found))
+        return None if match is None else (arrived, _place(robot, match))
 
     def settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
         """Complete the work of `keep` that a killed collector left."""
@@ -369,15 +369,15 @@ class SegmentStore:
         return self.path(place).stat().st_mtime_ns
 
     def marks(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
-        found = []
+        marks = []
         with contextlib.suppress(FileNotFoundError), os.scandir(self._folder / kind / robot) as entries:
             for entry in entries:
                 match = _MARK.fullmatch(entry.name)
                 if match is not None:
-                    found.append(_place(robot, match))
-                if len(found) == most:
+                    marks.append(_place(robot, match))
+                if len(marks) == most:
                     break
-        return found
+        return marks
 
     def robots_with(self, kind: str) -> list[str]:
         return sorted(os.listdir(self._folder / kind))  # noqa: PTH208  names, not paths
@@ -395,12 +395,12 @@ class SegmentStore:
         """Return whether each segment waits for the index, as after the start of a new collector."""
         return all(
             any(
-                (self._folder / kind / robot.name / one.mark).exists()
+                (self._folder / kind / robot.name / segment.mark).exists()
                 for kind in ("pending", "large", "damaged")
             )
             for robot in _folders(self._folder / "segments")
             for log in self.logs(robot.name)
-            for one in self.segments(robot.name, log)
+            for segment in self.segments(robot.name, log)
         )
 
     def mark_indexed(self, place: SegmentPlace) -> None:

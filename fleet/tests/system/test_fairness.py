@@ -132,12 +132,12 @@ def test_workers_end_with_the_collector(site: FleetSite, make_robot: MakeRobot) 
 
 
 def _descendants(process: int) -> list[int]:
-    found = []
+    descendants = []
     for task in Path(f"/proc/{process}/task").iterdir():
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # the thread has ended
             for child in map(int, (task / "children").read_text().split()):
-                found += [child, *_descendants(child)]
-    return found
+                descendants += [child, *_descendants(child)]
+    return descendants
 
 
 def test_no_content_of_a_segment_stops_the_index(site: FleetSite, make_robot: MakeRobot) -> None:

@@ -11,9 +11,9 @@ from tests.support.sources import ROOT
 
 
 def test_the_example_is_valid() -> None:
-    found = load_config(ROOT / "fleet/fleet.example.yaml")
-    assert found.certificate == Path("/var/lib/rosrv-fleet/server.pem")
-    assert found.address == ("0.0.0.0", 8444)
+    config = load_config(ROOT / "fleet/fleet.example.yaml")
+    assert config.certificate == Path("/var/lib/rosrv-fleet/server.pem")
+    assert config.address == ("0.0.0.0", 8444)
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:

@@ -43,18 +43,18 @@ def _opened(table: ClientConnections, address: str, number: int = 1) -> list[_So
     accepted = []
     for _ in range(number):
         let_time_pass(10.0)
-        one = _Socket()
-        if table.accepted(one, address):
-            accepted.append(one)
+        socket = _Socket()
+        if table.accepted(socket, address):
+            accepted.append(socket)
     return accepted
 
 
 async def test_unproven_addresses_leave_half_of_the_connections(table: ClientConnections) -> None:
-    others = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
+    others = [socket for number in range(17) for socket in _opened(table, f"203.0.113.{number}", 64)]
     assert sum(not one.cut for one in others) == 200
     (operator,) = _opened(table, "10.0.0.1")
     table.prove("10.0.0.1")
-    robots = [one for number in range(150) for one in _opened(table, f"10.1.0.{number}")]
+    robots = [socket for number in range(150) for socket in _opened(table, f"10.1.0.{number}")]
     assert all(table.established(robot.fileno(), f"robot{robot.fileno()}") for robot in robots)
     for number in range(17):
         _opened(table, f"203.0.113.{number}", 64)
@@ -75,7 +75,7 @@ async def test_robots_behind_one_address_do_not_wait_for_each_others_handshakes(
     waiting = _opened(table, "10.0.0.1", 300)
     assert len(waiting) == 64 + 4 * 30
     assert len(_opened(table, "10.0.0.2", 300)) == 64, "no robot has come from there"
-    others = [one for _number in range(100) for one in _opened(table, "10.0.0.3")]
+    others = [socket for _number in range(100) for socket in _opened(table, "10.0.0.3")]
     for number, one in enumerate(others[:60]):
         table.established(one.fileno(), f"another{number}")
     assert len(_opened(table, "10.0.0.3", 300)) <= 200, "at most half of the whole is for one address"
@@ -83,7 +83,7 @@ async def test_robots_behind_one_address_do_not_wait_for_each_others_handshakes(
 
 async def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
     (early,) = _opened(table, "10.0.0.7")
-    many = [one for number in range(1, 5) for one in _opened(table, f"203.0.113.{number}", 64)]
+    many = [socket for number in range(1, 5) for socket in _opened(table, f"203.0.113.{number}", 64)]
     (late,) = _opened(table, "10.0.0.8")
     assert not early.cut and not late.cut
     cut = next(one for one in many if one.cut)
@@ -94,7 +94,7 @@ async def test_room_is_made_by_the_address_with_most(table: ClientConnections) -
 
 async def test_a_customer_with_many_networks_keeps_no_robot_out(table: ClientConnections) -> None:
     """As after a start of the collector, when no address is proven yet."""
-    others = [one for number in range(250) for one in _opened(table, f"2001:db8:0:{number:x}::1")]
+    others = [socket for number in range(250) for socket in _opened(table, f"2001:db8:0:{number:x}::1")]
     assert len(others) == 64
     [robot] = _opened(table, "2001:db8:1::1")
     assert table.established(robot.fileno(), "arm1")
@@ -107,7 +107,7 @@ async def test_a_customer_with_many_networks_keeps_no_robot_out(table: ClientCon
 
 async def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
     for _ in range(3):
-        opened = [one for number in range(3) for one in _opened(table, f"203.0.113.{number}", 60)]
+        opened = [socket for number in range(3) for socket in _opened(table, f"203.0.113.{number}", 60)]
         assert len(opened) == 180
         assert table.established(opened[0].fileno(), "robot")
         for one in opened:
@@ -121,10 +121,10 @@ async def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnec
         for _ in range(seconds * 100):
             let_time_pass(0.01)
             for address in addresses:
-                one = _Socket()
-                if table.accepted(one, address):
+                socket = _Socket()
+                if table.accepted(socket, address):
                     done += 1
-                    table.closed(one.fileno())
+                    table.closed(socket.fileno())
         return done
 
     table.prove("10.0.0.1")

@@ -387,10 +387,10 @@ def test_a_stored_certificate_without_a_time_hides_no_robot(
     before = enrolled_robots(tmp_path, "arm1", "arm2").all()
     bad = msgspec.structs.replace(before["arm1"], certificate=own_certificate_until(_NO_TIMES[0]).decode())
     write_whole(tmp_path / "robots" / "arm1.json", msgspec.json.encode(bad), 0o600)
-    found = health_of(collector_in(tmp_path))
-    assert [robot.name for robot in found.robots] == ["arm2"]
-    assert found.trouble is not None
-    assert "arm1.json" in found.trouble
+    health = health_of(collector_in(tmp_path))
+    assert [robot.name for robot in health.robots] == ["arm2"]
+    assert health.trouble is not None
+    assert "arm1.json" in health.trouble
 
 
 def test_whatever_certificate_is_accepted_can_be_shown(tmp_path: Path) -> None:

@@ -179,9 +179,9 @@ def test_refusals_of_robots_that_were_off_when_their_ring_opened_count(
     refusing: list[str], state: RolloutState
 ) -> None:
     gates = msgspec.structs.replace(GATES, tolerance=0.1)
-    one = Terms(0, [Ring("all", [], 100)])
+    terms = Terms(0, [Ring("all", [], 100)])
     rollout = advance(
-        begun(one, gates), {robot: RobotSeen(-5000, OLD) for robot in ROBOTS} | all_at(0, OLD, 1), 0
+        begun(terms, gates), {robot: RobotSeen(-5000, OLD) for robot in ROBOTS} | all_at(0, OLD, 1), 0
     )
     assert list(rollout.baselines) == ["r0"]
     robots = all_at(60) | {robot: RobotSeen(60, OLD, "", NEW) for robot in refusing}

@@ -21,27 +21,27 @@ class _Reader(decoding.Reader):
 
     def instruction(self, code: int) -> decoding.WasmInstruction:
         begin = self.at - 1
-        one = super().instruction(code)
-        if not one.body and not one.otherwise:
-            self.found.append((begin, self.at, one))
-        return one
+        instruction = super().instruction(code)
+        if not instruction.body and not instruction.otherwise:
+            self.found.append((begin, self.at, instruction))
+        return instruction
 
 
-def _others(one: decoding.WasmInstruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
-    yield from _calculations(one)
-    yield from _places(one, kinds)
-    yield from _ways(one)
+def _others(instruction: decoding.WasmInstruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
+    yield from _calculations(instruction)
+    yield from _places(instruction, kinds)
+    yield from _ways(instruction)
 
 
-def _calculations(one: decoding.WasmInstruction) -> Iterator[tuple[str, bytes]]:
-    family, _, name = one.name.partition(".")
+def _calculations(instruction: decoding.WasmInstruction) -> Iterator[tuple[str, bytes]]:
+    family, _, name = instruction.name.partition(".")
     for left, right in _PAIRS:
         for here, other in ((left, right), (right, left)):
             if name == here:
                 yield "operation", bytes((_OPCODES[f"{family}.{other}"],))
     if name == "const":
         code = b"\x41" if family == "i32" else b"\x42"
-        whole = int(one.operands[0])
+        whole = int(instruction.operands[0])
         for value in {whole + 1, whole - 1, whole ^ 2}:
             yield "constant", code + signed(value)
 

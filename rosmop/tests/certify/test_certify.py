@@ -129,18 +129,18 @@ def tables_of(compiled: CompiledProperty) -> AutomatonTables:
     return AutomatonTables(made.initial, made.table, made.verdicts, timeouts)
 
 
-def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
-    seen = {(one.initial, other.initial)}
+def same_verdicts(tables: AutomatonTables, other: AutomatonTables) -> bool:
+    seen = {(tables.initial, other.initial)}
     waiting = list(seen)
     for left, right in waiting:
-        targets = list(zip(one.table[left], other.table[right], strict=True))
-        if one.timeouts and (one.timeouts[left] or other.timeouts[right]):
-            first, second = one.timeouts[left], other.timeouts[right]
+        targets = list(zip(tables.table[left], other.table[right], strict=True))
+        if tables.timeouts and (tables.timeouts[left] or other.timeouts[right]):
+            first, second = tables.timeouts[left], other.timeouts[right]
             if first is None or second is None or first[0] != second[0]:
                 return False
             targets.append((first[1], second[1]))
         for pair in targets:
-            if one.verdicts[pair[0]] != other.verdicts[pair[1]]:
+            if tables.verdicts[pair[0]] != other.verdicts[pair[1]]:
                 return False
             if pair not in seen:
                 seen.add(pair)

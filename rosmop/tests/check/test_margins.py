@@ -37,8 +37,8 @@ def give(monitors: MonitorSet, form: str, *values: int | float, walking: bool = 
 
 def said(margins: Sequence[Margin]) -> list[tuple[int, bool, float, float, float | None]]:
     return [
-        (one.position.line, one.holds, one.left, one.right, one.threshold_at)
-        for one in sorted(margins, key=lambda one: (one.position, not one.holds))
+        (margin.position.line, margin.holds, margin.left, margin.right, margin.threshold_at)
+        for margin in sorted(margins, key=lambda one: (one.position, not one.holds))
     ]
 
 

@@ -184,7 +184,7 @@ def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
         expected = printed(body, CPP + before, directory, "-std=c++17")
         for line, value, one in zip(outcome.log, expected, statements, strict=True):
             assert line.text == value, one
-    chosen = " ".join(f"if (c == {number}) {{ {one} }}" for number, one in enumerate(statements))
+    chosen = " ".join(f"if (c == {number}) {{ {statement} }}" for number, statement in enumerate(statements))
     fed = BothWays(f"s() {{ {before} event e(int c) /plain own/Plain '{{count:c}}' {{ {chosen} }} }}")
     for number in range(count):
         fed.check([plain(count=number)])

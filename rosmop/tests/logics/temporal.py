@@ -15,7 +15,7 @@ CONNECTIVES: Mapping[str, Callable[..., bool]] = {
     "implies": lambda left, right: not left or right,
     "iff": lambda left, right: left == right,
 }
-BOOLEAN = tuple(one for one in CONNECTIVES if one != "not")
+BOOLEAN = tuple(connective for connective in CONNECTIVES if connective != "not")
 SPELLED = {
     "not": ("!", "not "),
     "and": ("and",),

@@ -34,25 +34,25 @@ def _block(body: Sequence[WasmInstruction]) -> bytes:
     return b"".join(map(_instruction, body))
 
 
-def _instruction(one: WasmInstruction) -> bytes:
-    name, operands = one.name, one.operands
+def _instruction(instruction: WasmInstruction) -> bytes:
+    name, operands = instruction.name, instruction.operands
     if name.endswith(".const"):
-        return _constant(one)
+        return _constant(instruction)
     if name in _MEMORY:
         return bytes((_MEMORY[name], 0)) + unsigned(int(operands[0]))
     if name in _LONG:
         return bytes((_MORE, _LONG[name], *map(int, operands)))
     if name in ("block", "loop", "if"):
-        otherwise = _ELSE + _block(one.otherwise) if one.otherwise else b""
-        return _CODES[name] + bytes((int(operands[0]),)) + _block(one.body) + otherwise + _END
+        otherwise = _ELSE + _block(instruction.otherwise) if instruction.otherwise else b""
+        return _CODES[name] + bytes((int(operands[0]),)) + _block(instruction.body) + otherwise + _END
     return _CODES[name] + b"".join(unsigned(int(operand)) for operand in operands)
 
 
-def _constant(one: WasmInstruction) -> bytes:
-    number = one.operands[0]
-    if one.name == "f32.const":
+def _constant(instruction: WasmInstruction) -> bytes:
+    number = instruction.operands[0]
+    if instruction.name == "f32.const":
         return b"\x43" + struct.pack("<f", number)
-    if one.name == "f64.const":
+    if instruction.name == "f64.const":
         return b"\x44" + struct.pack("<d", number)
-    half = 1 << int(one.name[1:3]) - 1
+    half = 1 << int(instruction.name[1:3]) - 1
     return (b"\x41" if half >> 32 == 0 else b"\x42") + signed((int(number) + half) % (2 * half) - half)

@@ -20,25 +20,25 @@ _OTHER = {"add": "sub", "sub": "add", "mul": "add", "div": "mul", "and": "or", "
           "neg": "abs", "abs": "neg", "floor": "ceil", "ceil": "floor", "rem": "div"}  # fmt: skip
 
 
-def _comparison(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    family, _, name = one.name.partition(".")
+def _comparison(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
+    family, _, name = instruction.name.partition(".")
     name, _, sign = name.partition("_")
     if name in _COMPARED:
         other = _COMPARED[_COMPARED.index(name) ^ 1]
         needs = other not in ("eq", "ne") and family[0] == "i"
-        yield replace(one, name=f"{family}.{other}" + (f"_{sign or 's'}" if needs else ""))
+        yield replace(instruction, name=f"{family}.{other}" + (f"_{sign or 's'}" if needs else ""))
         if name in ("lt", "gt", "le", "ge"):
             turned = {"lt": "gt", "gt": "lt", "le": "ge", "ge": "le"}[name]
-            yield replace(one, name=f"{family}.{turned}" + (f"_{sign}" if sign else ""))
+            yield replace(instruction, name=f"{family}.{turned}" + (f"_{sign}" if sign else ""))
 
 
-def _operation(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    family, _, name = one.name.partition(".")
+def _operation(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
+    family, _, name = instruction.name.partition(".")
     name, _, sign = name.partition("_")
     if name in _OTHER and family in ("i32", "i64", "f32", "f64"):
         other = _OTHER[name]
         yield replace(
-            one, name=f"{family}.{other}" + (f"_{sign}" if other in ("div", "rem") and sign else "")
+            instruction, name=f"{family}.{other}" + (f"_{sign}" if other in ("div", "rem") and sign else "")
         )
 
 
@@ -47,35 +47,35 @@ def _sign(one: WasmInstruction) -> Iterator[WasmInstruction]:
         yield replace(one, name=one.name[:-1] + ("u" if one.name.endswith("s") else "s"))
 
 
-def _width(one: WasmInstruction) -> Iterator[WasmInstruction]:
+def _width(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
     widths = {
         "i32.load": "i32.load16_u", "i32.load8_u": "i32.load16_u", "i32.load16_u": "i32.load8_u",
         "i32.load8_s": "i32.load16_s", "i32.load16_s": "i32.load8_s", "i32.store8": "i32.store16",
         "i32.store16": "i32.store", "i32.store": "i32.store16", "i32.extend8_s": "i32.extend16_s",
         "i32.extend16_s": "i32.extend8_s",
     }  # fmt: skip
-    if one.name in widths:
-        yield replace(one, name=widths[one.name])
+    if instruction.name in widths:
+        yield replace(instruction, name=widths[instruction.name])
 
 
-def _offset(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    if ".load" in one.name or ".store" in one.name:
-        yield replace(one, operands=(one.operands[0] + 1,))
-        yield replace(one, operands=(one.operands[0] + 8,))
+def _offset(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
+    if ".load" in instruction.name or ".store" in instruction.name:
+        yield replace(instruction, operands=(instruction.operands[0] + 1,))
+        yield replace(instruction, operands=(instruction.operands[0] + 8,))
 
 
-def _constant(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    if one.name.endswith(".const"):
-        yield replace(one, operands=(one.operands[0] + 1,))
-        if one.operands[0]:
-            yield replace(one, operands=(-one.operands[0],))
+def _constant(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
+    if instruction.name.endswith(".const"):
+        yield replace(instruction, operands=(instruction.operands[0] + 1,))
+        if instruction.operands[0]:
+            yield replace(instruction, operands=(-instruction.operands[0],))
 
 
-def _check(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    if one.name == "if" and one.body:
-        if not one.otherwise:
+def _check(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
+    if instruction.name == "if" and instruction.body:
+        if not instruction.otherwise:
             yield WasmInstruction("drop")
-        yield replace(one, body=one.otherwise, otherwise=one.body)
+        yield replace(instruction, body=instruction.otherwise, otherwise=instruction.body)
 
 
 FAULTS: dict[str, Callable[[WasmInstruction], Iterator[WasmInstruction]]] = {
@@ -100,12 +100,12 @@ def operands(code: Code) -> Iterator[tuple[WasmInstruction, ...]]:
     """Each fault reads the next variable of the same type."""
     kinds = [*code.parameters, *code.made]
 
-    def change(one: WasmInstruction) -> Iterator[WasmInstruction]:
-        if one.name == "local.get":
-            place = int(one.operands[0])
+    def change(instruction: WasmInstruction) -> Iterator[WasmInstruction]:
+        if instruction.name == "local.get":
+            place = int(instruction.operands[0])
             same = [other for other, kind in enumerate(kinds) if kind == kinds[place] and other != place]
             if same:
-                yield replace(one, operands=(same[place % len(same)],))
+                yield replace(instruction, operands=(same[place % len(same)],))
 
     yield from _trees(code.body, change)
 

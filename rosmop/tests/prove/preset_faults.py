@@ -98,8 +98,8 @@ def _validation(
 
 def _variables(code: Compiled) -> list[str]:
     """Return the variables of the text and given constants; those of noted comparisons have no effect."""
-    [one] = code.specifications
-    return [*one.variables.values(), *(given.code for given in one.givens)]
+    [specification] = code.specifications
+    return [*specification.variables.values(), *(given.code for given in specification.givens)]
 
 
 def _renamed(names: Mapping[_Key, int], addresses: Mapping[_Key, int]) -> dict[_Key, int]:

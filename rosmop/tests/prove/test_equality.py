@@ -16,7 +16,7 @@ PRESETS = sorted(MONITORS.glob("guards/*.rv"))
 
 
 def answers(text: str, known: Definitions | None = None, patience: float = 600) -> dict[str, str]:
-    return {one.event: one.answer for one in findings_of(compiled(text, known), patience)}
+    return {finding.event: finding.answer for finding in findings_of(compiled(text, known), patience)}
 
 
 UNDECIDED = "not decided in time"

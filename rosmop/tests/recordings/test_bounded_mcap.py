@@ -38,8 +38,8 @@ def refusal(path: Path) -> str:
 def test_messages_are_in_the_order_of_time(tmp_path: Path) -> None:
     chance = random.Random(1)  # noqa: S311  no secret
     rows = [(number // 20 * 10 + chance.randrange(40), str(number).encode()) for number in range(500)]
-    found = list(RecordedFile(make_mcap(tmp_path / "x.mcap", rows), ["*"]).messages())
-    assert [(time, data) for _topic, time, data in found] == sorted(rows, key=lambda row: row[0])
+    messages = list(RecordedFile(make_mcap(tmp_path / "x.mcap", rows), ["*"]).messages())
+    assert [(time, data) for _topic, time, data in messages] == sorted(rows, key=lambda row: row[0])
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -53,9 +53,9 @@ HEADS = [
 
 @pytest.mark.parametrize(("head", "name", "modifiers"), HEADS)
 def test_the_head_of_a_specification(head: str, name: str, modifiers: tuple[str, ...]) -> None:
-    found = parsed(f"{head} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
-    assert found.name == name
-    assert tuple(modifier.parts[0] for modifier in found.modifiers) == modifiers
+    specification = parsed(f"{head} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
+    assert specification.name == name
+    assert tuple(modifier.parts[0] for modifier in specification.modifiers) == modifiers
 
 
 @pytest.mark.parametrize(
@@ -182,14 +182,14 @@ def test_the_older_brackets_of_actions() -> None:
 
 
 def test_properties() -> None:
-    found = parsed("""s() {
+    specification = parsed("""s() {
     event e() /t std_msgs/Empty '{}' { }
     ERE :  (e e)* // not @this
        e
     @match { __RESET; } @fail { }
     fsm: s0 [ e -> s0 ] @s0 { }
     }""")
-    first, second = found.properties
+    first, second = specification.properties
     assert (first.logic, first.formula.split(), second.formula) == (
         "ERE",
         ["(e", "e)*", "//", "not", "@this", "e"],
@@ -201,10 +201,10 @@ def test_properties() -> None:
 
 @pytest.mark.parametrize("name", ["auto", "new", "break", "try", "default", "NULL"])
 def test_a_category_may_be_a_word_of_cpp(name: str) -> None:
-    found = parsed(
+    specification = parsed(
         f"s() {{ event e() /t std_msgs/Empty '{{}}' {{ }} fsm: {name} [ e -> {name} ] @{name} {{ }} }}"
     )
-    assert [handler.category for handler in found.properties[0].handlers] == [name]
+    assert [handler.category for handler in specification.properties[0].handlers] == [name]
 
 
 NAMES = ["event", "init", "service", "every", "when", "request", "response", "hold"]

@@ -45,9 +45,9 @@ def api_of(rest: Rest) -> int:
 
 def resident(pid: int) -> int:
     text = Path(f"/proc/{pid}/status").read_text()
-    found = re.search(r"VmRSS:\s+(\d+) kB", text)
-    assert found is not None
-    return int(found[1]) << 10
+    match = re.search(r"VmRSS:\s+(\d+) kB", text)
+    assert match is not None
+    return int(match[1]) << 10
 
 
 def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:

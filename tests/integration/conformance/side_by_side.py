@@ -171,5 +171,5 @@ def _told(message: str) -> str:
         r"\[[^]]+\] is (not a registered node$|not a (known )?provider of|no longer the current)", message
     ):
         return "nothing ended"
-    found = re.match(r"ERROR: parameter \[\w+\]", message)
-    return found.group() if found else message
+    match = re.match(r"ERROR: parameter \[\w+\]", message)
+    return match.group() if match else message

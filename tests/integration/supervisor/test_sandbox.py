@@ -122,9 +122,9 @@ class Place:
             "fleet": {"collector": f"https://127.0.0.1:{self.ports[0]}", **files},
         }
         sections = [
-            one.settings(**receivers[one.settings.place])
-            for one in FEATURES
-            if one.settings is not None and one.settings.place in receivers
+            feature.settings(**receivers[feature.settings.place])
+            for feature in FEATURES
+            if feature.settings is not None and feature.settings.place in receivers
         ]
         facts = Facts(
             self.state.path,

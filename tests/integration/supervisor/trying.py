@@ -38,13 +38,13 @@ def run_modules(*_given: Any) -> None:
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
     machines = []
     for _ in range(2):
-        one = WasmInstance(translate(DIVIDES, 1 << 24), 1 << 24)
-        machines.append(one)
-        one.reserve(1 << 24)
-        one.memory[-1] = 1
-        told["results"].append(one.call("divide", 42, 6, fuel=100))
+        instance = WasmInstance(translate(DIVIDES, 1 << 24), 1 << 24)
+        machines.append(instance)
+        instance.reserve(1 << 24)
+        instance.memory[-1] = 1
+        told["results"].append(instance.call("divide", 42, 6, fuel=100))
         try:
-            one.call("divide", 1, 0, fuel=100)
+            instance.call("divide", 1, 0, fuel=100)
         except WasmTrap as trap:
             told["traps"].append(trap.reason)
     told["executable"] = _executable()

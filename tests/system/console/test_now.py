@@ -188,7 +188,7 @@ def test_an_order_without_an_answer_is_not_reported_as_given(
     reader = opened()
     page = reader.page
     now = json.loads(
-        next(one["data"] for one in appliance.rest().events("/v1/live") if one.get("event") == "now")
+        next(event["data"] for event in appliance.rest().events("/v1/live") if event.get("event") == "now")
     )
     now["status"]["standby"] = _PAIR
     state = f"event: now\ndata: {json.dumps(now)}\n\n"

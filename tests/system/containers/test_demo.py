@@ -71,7 +71,7 @@ def test_nodes_have_no_setting_but_the_master(demo: Compose) -> None:
 
 
 def test_denials_of_the_visitor_name_the_rule(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    succeeded = {name for name, one in attacks.items() if one["succeeded"]}
+    succeeded = {name for name, attack in attacks.items() if attack["succeeded"]}
     assert succeeded == {"watch the battery"}
     assert len(attacks) >= 12
     resources = {"getSystemState", "shutdownMaster", "/landshark/gps"}

@@ -337,9 +337,9 @@ def charon_of(site: TunnelSite) -> int:
 
 
 def kilobytes(pid: int) -> int:
-    found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
-    assert found is not None
-    return int(found[1])
+    match = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
+    assert match is not None
+    return int(match[1])
 
 
 def test_garbage_on_the_ports_of_ike(site: TunnelSite, kit: Path, other: Host, others_kit: Path) -> None:

@@ -50,9 +50,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
     (home / "appliance.yaml").write_text(CONFIG)
     with Lab("rosrv-enrol") as lab:
         policy = POLICY.replace("host:ocu-1", "host:laptop host:other")
-        one = TunnelSite(lab, home, policy=policy, options=("--config", str(home / "appliance.yaml")))
-        with one:
-            yield one
+        tunnel_site = TunnelSite(lab, home, policy=policy, options=("--config", str(home / "appliance.yaml")))
+        with tunnel_site:
+            yield tunnel_site
 
 
 @pytest.fixture

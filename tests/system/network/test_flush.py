@@ -153,10 +153,10 @@ def test_a_connection_that_ends_first_leaves_its_listener_alone(lab: Lab) -> Non
         accepted, _ = listener.accept()
         caller.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
-        def ends_first(one: TcpSocket) -> bool:
+        def ends_first(tcp_socket: TcpSocket) -> bool:
             caller.close()
             accepted.close()
-            return one.port == port
+            return tcp_socket.port == port
 
         assert end_connections(robot.namespace, ends_first) == 0
         socket.create_connection((robot.address, port), timeout=5).close()

@@ -45,14 +45,14 @@ VERBS = [
 ]
 
 
-def folder(place: Path) -> None:
-    (place / "p").mkdir(parents=True)
-    os.mkfifo(place / "p" / "T.msg")
+def folder(path: Path) -> None:
+    (path / "p").mkdir(parents=True)
+    os.mkfifo(path / "p" / "T.msg")
 
 
-def huge(place: Path) -> None:
-    place.touch()
-    os.truncate(place, 1 << 30)
+def huge(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 30)
 
 
 KINDS: dict[str, Callable[[Path], object]] = {

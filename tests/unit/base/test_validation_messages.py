@@ -128,7 +128,7 @@ def _said_of(reads: Any, value: Any) -> set[str]:
     try:
         asyncio.run(reads(Request({"type": "http", "headers": headers}, sent)))
     except ProblemError as problem:
-        return {one.text for one in problem.errors or ()}
+        return {error.text for error in problem.errors or ()}
     return set()
 
 

@@ -99,7 +99,7 @@ def test_a_wrong_time_names_its_option(name: str, option: str, kind: str) -> Non
 
 
 def _handlers(path: Path) -> list[str]:
-    found = []
+    handlers = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if not isinstance(node, ast.ExceptHandler) or node.name is None or not _only_os(node.type):
             continue
@@ -107,14 +107,14 @@ def _handlers(path: Path) -> list[str]:
             if not isinstance(value, ast.FormattedValue) or not isinstance(value.value, ast.Name):
                 continue
             if value.value.id == node.name:
-                found.append(f"{path.relative_to(ROOT)}:{value.lineno}")
-    return found
+                handlers.append(f"{path.relative_to(ROOT)}:{value.lineno}")
+    return handlers
 
 
 def _only_os(kind: Any) -> bool:
     names = kind.elts if isinstance(kind, ast.Tuple) else [kind]
     return bool(names) and all(
-        isinstance(one, ast.Name) and (one.id == "OSError" or "File" in one.id) for one in names
+        isinstance(name, ast.Name) and (name.id == "OSError" or "File" in name.id) for name in names
     )
 
 

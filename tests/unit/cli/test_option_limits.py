@@ -39,9 +39,9 @@ def _arguments(verb: str, given: str) -> list[str]:
 
 
 DURATIONS = sorted(
-    (one.verb, one.name)
-    for one in OPTIONS
-    if one.metavar == "DURATION" and (one.verb, one.name) not in NO_TIME
+    (option.verb, option.name)
+    for option in OPTIONS
+    if option.metavar == "DURATION" and (option.verb, option.name) not in NO_TIME
 )
 
 
@@ -63,7 +63,7 @@ def test_a_duration_has_a_maximum(verb: str, option: str, tmp_path: Path) -> Non
 def test_each_option_beside_a_dry_run_is_reported_or_refused() -> None:
     found = {
         verb: {one.name for one in OPTIONS if one.verb == verb} - _OUTPUT - set(REFUSED) - {"--within"}
-        for verb in {one.verb for one in OPTIONS if one.name == "--dry-run"}
+        for verb in {option.verb for option in OPTIONS if option.name == "--dry-run"}
     }
     assert found == REPORTED
 

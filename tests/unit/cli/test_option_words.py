@@ -50,13 +50,13 @@ OPTIONS = [
 
 
 def test_a_point_in_time_is_time_and_a_length_is_duration() -> None:
-    for one in OPTIONS:
-        if (one.verb, one.name) in NO_TIME:
+    for option in OPTIONS:
+        if (option.verb, option.name) in NO_TIME:
             continue
-        if one.name in POINTS or one.metavar.startswith("TIME"):
-            assert one.metavar == POINTS.get(one.name), one
-        if one.name in DURATIONS or one.metavar == "DURATION":
-            assert (one.name in DURATIONS, one.metavar) == (True, "DURATION"), one
+        if option.name in POINTS or option.metavar.startswith("TIME"):
+            assert option.metavar == POINTS.get(option.name), option
+        if option.name in DURATIONS or option.metavar == "DURATION":
+            assert (option.name in DURATIONS, option.metavar) == (True, "DURATION"), option
 
 
 def test_no_time_is_a_bare_number() -> None:
@@ -66,24 +66,24 @@ def test_no_time_is_a_bare_number() -> None:
 
 
 def test_a_file_that_a_verb_writes_is_its_output() -> None:
-    for one in OPTIONS:
-        writes = one.help.startswith(("File for", "File to write", "File,", "File (", "Write", "Draw"))
-        if (one.verb, one.name) in SECOND_OUTPUTS:
-            assert one.metavar == "FILE", one
-        elif one.name == "--output" or (writes and one.metavar in ("FILE", "DIR")):
-            assert (one.name, "-o" in one.given.opts) == ("--output", True), one
+    for option in OPTIONS:
+        writes = option.help.startswith(("File for", "File to write", "File,", "File (", "Write", "Draw"))
+        if (option.verb, option.name) in SECOND_OUTPUTS:
+            assert option.metavar == "FILE", option
+        elif option.name == "--output" or (writes and option.metavar in ("FILE", "DIR")):
+            assert (option.name, "-o" in option.given.opts) == ("--output", True), option
 
 
 def test_an_option_that_consents_is_yes_or_force() -> None:
-    for one in OPTIONS:
-        assert (one.name == "--yes") is one.help.startswith("Do not ask"), one
-        assert (one.name in CONSENT) is bool(EVEN.match(one.help)), one
+    for option in OPTIONS:
+        assert (option.name == "--yes") is option.help.startswith("Do not ask"), option
+        assert (option.name in CONSENT) is bool(EVEN.match(option.help)), option
 
 
 def test_an_option_has_one_metavar_in_all_verbs() -> None:
     found = defaultdict(set)
-    for one in OPTIONS:
-        found[one.name].add(one.metavar)
+    for option in OPTIONS:
+        found[option.name].add(option.metavar)
     assert {name: kinds for name, kinds in found.items() if len(kinds) > 1} == MEANINGS
 
 
@@ -94,4 +94,4 @@ def test_an_argument_is_in_capitals() -> None:
 
 
 def test_help_of_options_is_a_phrase_without_a_full_stop() -> None:
-    assert [one for one in OPTIONS if one.help.endswith(".")] == []
+    assert [option for option in OPTIONS if option.help.endswith(".")] == []

@@ -89,7 +89,7 @@ _MARKED = re.compile(r"\(UTC\)|^\S|^ +(2>|->|<-|\{)")
 
 
 @pytest.mark.parametrize(
-    "section", [one for one in sections(*sorted(_FILES)) if _UTC.search(one.values[0].text)]
+    "section", [section for section in sections(*sorted(_FILES)) if _UTC.search(section.values[0].text)]
 )
 def test_times_for_people_are_in_the_machines_zone(
     transcript: Transcript, monkeypatch: pytest.MonkeyPatch, section: Section

@@ -115,7 +115,7 @@ def is_order(request: type[AdminRequest[Any]]) -> bool:
 
 
 def test_each_order_waits_or_has_a_reason() -> None:
-    orders = {str(one.__struct_config__.tag) for one in REQUESTS if is_order(one)}
+    orders = {str(request.__struct_config__.tag) for request in REQUESTS if is_order(request)}
     assert not WAITS.keys() & AT_ONCE.keys()
     require_rows(orders, WAITS.keys() | AT_ONCE.keys(), "WAITS, or AT_ONCE with the reason")
     waiting = {

@@ -64,5 +64,5 @@ def test_the_last_one_keeps_the_robot_slow_while_its_gun_is_raised(folder: Path)
     (folder / "calm.rv").write_text(LAST)
     assert said("check", "my-monitors/calm.rv") == ["1 specification OK"]
     drive = Simulation([folder / "calm.rv"]).run()
-    steps = [math.dist((one.x, one.y), (next_.x, next_.y)) for one, next_ in pairwise(drive.poses)]
+    steps = [math.dist((pose.x, pose.y), (next_.x, next_.y)) for pose, next_ in pairwise(drive.poses)]
     assert 0 < max(steps) <= 0.5 * STEP / 10**9 + 1e-9

@@ -322,7 +322,7 @@ class InProcess(Verifier):
 def of_evidence(site: Site, folder: Path, lines: Lines, copies: list[SignedCheckpoint]) -> Iterator[str]:
     for name, parts in ({**site.evidence, "records.ndjson": lines}).items():
         (folder / name).write_bytes(b"".join(parts))
-    kept = {(one.log, one.number): [json.loads(one.as_json())] for one in copies}
+    kept = {(copy.log, copy.number): [json.loads(copy.as_json())] for copy in copies}
     verifier = InProcess(folder, site.public, kept)
     verifier.run()
     yield f"evidence: {verifier.checkpoints} checkpoints, {verifier.agreeing} kept elsewhere"

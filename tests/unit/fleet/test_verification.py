@@ -37,12 +37,12 @@ def _remove_once(patch: pytest.MonkeyPatch, remove: Callable[[], object], *, lis
 
 @pytest.fixture
 def store(make_log: MakeLog, path: Path, tmp_path: Path) -> SegmentStore:
-    found = SegmentStore(tmp_path / "data", 0)
-    _push(found, make_log, path, tmp_path)
-    return found
+    segment_store = SegmentStore(tmp_path / "data", 0)
+    _push(segment_store, make_log, path, tmp_path)
+    return segment_store
 
 
-def _push(found: SegmentStore, make_log: MakeLog, path: Path, tmp_path: Path) -> None:
+def _push(segment_store: SegmentStore, make_log: MakeLog, path: Path, tmp_path: Path) -> None:
     log = make_log(checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))
@@ -56,10 +56,10 @@ def _push(found: SegmentStore, make_log: MakeLog, path: Path, tmp_path: Path) ->
             break
         upload = tmp_path / "upload"
         upload.write_bytes(gzip.compress(b"".join(lines)))
-        place = found.keep("arm1", upload, summary, 1)
+        place = segment_store.keep("arm1", upload, summary, 1)
         upload.unlink()
-        os.utime(found.path(place), (1e9, 1e9))
-        found.mark_indexed(place)
+        os.utime(segment_store.path(place), (1e9, 1e9))
+        segment_store.mark_indexed(place)
     assert log.close() is None
 
 

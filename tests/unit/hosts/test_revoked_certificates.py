@@ -27,9 +27,9 @@ def serials(count: int) -> list[str]:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
-    one = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    yield one
-    one.close()
+    state_store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
+    yield state_store
+    state_store.close()
 
 
 def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: Path) -> int:

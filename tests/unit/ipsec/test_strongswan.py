@@ -55,12 +55,12 @@ def test_an_unknown_connection_has_no_host() -> None:
 
 def test_ml_kem_is_offered_where_charon_has_it() -> None:
     assert proposals_of(["CURVE_25519", "ECP_384"]).key_exchange == ["x25519", "ecp384"]
-    found = proposals_of(["ECP_384", "CURVE_25519", "ML_KEM_768", "MODP_1024"])
-    assert found.key_exchange == ["x25519+mlkem768", "x25519", "ecp384"]
-    assert found.ike[0] == "aes256gcm16-prfsha384-x25519-ke1_mlkem768"
-    assert found.esp[0] == "aes256gcm16-x25519-ke1_mlkem768"
-    (row,) = connection(HOST, STATED, found).values()
-    assert row["proposals"] == list(found.ike)
+    proposals = proposals_of(["ECP_384", "CURVE_25519", "ML_KEM_768", "MODP_1024"])
+    assert proposals.key_exchange == ["x25519+mlkem768", "x25519", "ecp384"]
+    assert proposals.ike[0] == "aes256gcm16-prfsha384-x25519-ke1_mlkem768"
+    assert proposals.esp[0] == "aes256gcm16-x25519-ke1_mlkem768"
+    (row,) = connection(HOST, STATED, proposals).values()
+    assert row["proposals"] == list(proposals.ike)
 
 
 def test_two_hundred_addresses_leave_handshakes_for_hosts() -> None:

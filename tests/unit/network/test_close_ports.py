@@ -103,8 +103,8 @@ def test_an_address_that_no_appliance_can_have_is_named(text: str) -> None:
 
 
 def test_the_default_range_is_the_kernels() -> None:
-    found = local_port_range()
-    assert 1 <= found.first < found.last <= 65535
+    port_range = local_port_range()
+    assert 1 <= port_range.first < port_range.last <= 65535
 
 
 def test_units_that_come_before_the_network_fit_into_the_boot() -> None:

@@ -60,8 +60,8 @@ getBusInfo = localhost
 def errors_of(text: str) -> list[str]:
     with pytest.raises(PolicyError) as caught:
         compile_policy(text, file="p.ini")
-    found = [f for f in caught.value.findings if f.severity is FindingSeverity.ERROR]
-    return [f"{f.line}:{f.column}: {f.text}" for f in found]
+    findings = [f for f in caught.value.findings if f.severity is FindingSeverity.ERROR]
+    return [f"{f.line}:{f.column}: {f.text}" for f in findings]
 
 
 def test_policy_of_the_shape_of_rosrvs_loads() -> None:
@@ -71,16 +71,16 @@ def test_policy_of_the_shape_of_rosrvs_loads() -> None:
 
 
 def test_uses_of_a_commented_out_group_are_errors() -> None:
-    found = errors_of(SAMPLE_OF_ROSRV.replace("\nocu =", "\n#ocu ="))
-    assert found[0].startswith('17:22: no group "ocu" is defined')
-    assert len(found) == 8
+    errors = errors_of(SAMPLE_OF_ROSRV.replace("\nocu =", "\n#ocu ="))
+    assert errors[0].startswith('17:22: no group "ocu" is defined')
+    assert len(errors) == 8
 
 
 @pytest.mark.parametrize(("text", "expected"), mistakes("policy"))
 def test_a_mistake_is_an_error_with_its_place_and_a_hint(text: str, expected: str) -> None:
-    found = errors_of(text)
-    assert len(found) == 1
-    assert found[0].startswith(expected)
+    errors = errors_of(text)
+    assert len(errors) == 1
+    assert errors[0].startswith(expected)
 
 
 def test_all_mistakes_are_reported_at_once() -> None:
@@ -99,14 +99,14 @@ def test_error_says_file_line_and_column_as_compilers_do() -> None:
 
 
 def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
-    found = errors_of("#" * (MAXIMUM_CHARACTERS + 1))
+    errors = errors_of("#" * (MAXIMUM_CHARACTERS + 1))
     size = f"{MAXIMUM_CHARACTERS + 1} characters; the limit is {MAXIMUM_CHARACTERS}"
-    assert found == [f"1:1: the file has {size}"]
+    assert errors == [f"1:1: the file has {size}"]
 
 
 def test_errors_beyond_the_limit_are_only_counted() -> None:
-    found = errors_of("[Ports]\nrange = x\n" + "x\n" * MAXIMUM_FINDINGS)
-    assert (len(found), found[-1][-25:]) == (MAXIMUM_FINDINGS + 1, "1 more error is not shown")
+    errors = errors_of("[Ports]\nrange = x\n" + "x\n" * MAXIMUM_FINDINGS)
+    assert (len(errors), errors[-1][-25:]) == (MAXIMUM_FINDINGS + 1, "1 more error is not shown")
 
 
 @pytest.mark.parametrize(

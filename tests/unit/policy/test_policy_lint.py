@@ -67,9 +67,9 @@ def test_doubtful_policy_is_warned_about_with_its_place(old: str, new: str, expe
 
 def test_host_that_lacks_a_node_name_is_named_once() -> None:
     text = RIGHT.replace("/ocu = op\n", "").replace("[Subscribers]", "/a = op\n/b = op\n[Subscribers]")
-    found = [warning for warning in warnings_of(text) if "10.0.0.5" in warning]
-    assert len(found) == 1
-    assert "(5 rules)" in found[0]
+    warnings = [warning for warning in warnings_of(text) if "10.0.0.5" in warning]
+    assert len(warnings) == 1
+    assert "(5 rules)" in warnings[0]
 
 
 def test_network_that_overlaps_a_node_right_is_not_dead() -> None:
@@ -82,6 +82,6 @@ def test_loopback_is_warned_about_where_the_robot_is_elsewhere() -> None:
     (unknown,) = warnings_of(text)
     assert "127.0.0.1 is the appliance itself (unless isolation is none): write robot" in unknown
     assert warnings_of(text, robot="127.0.0.1") == []
-    found = warnings_of(text, robot="172.17.0.1")
-    assert len(found) == 1
-    assert "127.0.0.1 is the appliance itself here; the robot is 172.17.0.1" in found[0]
+    warnings = warnings_of(text, robot="172.17.0.1")
+    assert len(warnings) == 1
+    assert "127.0.0.1 is the appliance itself here; the robot is 172.17.0.1" in warnings[0]

@@ -72,10 +72,10 @@ def test_the_time_until_a_group_is_free(written: str, seconds: float) -> None:
 )
 def test_a_mistake_says_what_to_write(text: str, error: str) -> None:
     """Each at the check of the policy, before it is in force."""
-    found = errors_of(text)
-    assert any(error in one for one in found), found
+    errors = errors_of(text)
+    assert any(error in one for one in errors), errors
 
 
 def test_free_needs_a_rank() -> None:
     """A line that would do nothing is an error."""
-    assert any("rank base" in one for one in errors_of(GROUP + "take base = web\nfree base = 300ms\n"))
+    assert any("rank base" in error for error in errors_of(GROUP + "take base = web\nfree base = 300ms\n"))

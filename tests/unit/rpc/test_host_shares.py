@@ -43,8 +43,8 @@ async def test_hostile_members_delay_no_honest_one_and_the_whole_has_an_end(
         return "honest"
 
     began = clock.now()
-    found = await serve_by_host(members, work, SHARE)
-    assert (found["own"], found["nuc"]) == ("honest", "honest")
+    results = await serve_by_host(members, work, SHARE)
+    assert (results["own"], results["nuc"]) == ("honest", "honest")
     assert clock.now() - began <= SHARE.whole
     if hosts == 1:
         assert max(at.values()) - began < 0.2, "another host's members wait for nothing"
@@ -59,8 +59,8 @@ async def test_the_first_members_are_served_first_and_a_host_has_its_time_from_i
         await asyncio.sleep(0.9)
         return name
 
-    found = await serve_by_host({"own": "a", "second": "b", "third": "c"}, work, share)
-    assert found.keys() == {*order} == {"own", "second", "third"}
+    results = await serve_by_host({"own": "a", "second": "b", "third": "c"}, work, share)
+    assert results.keys() == {*order} == {"own", "second", "third"}
     assert order[0] == "own"
 
 

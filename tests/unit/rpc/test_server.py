@@ -211,8 +211,8 @@ async def test_a_program_that_the_kernel_refuses(later: bool) -> None:
 
 
 async def test_connections_that_ended_before_they_are_opened() -> None:
-    one = Bounds(whole=1, host=1, unknown=0, kept=0)
-    async with serving(shares=Shares(connections=one)) as server:
+    bounds = Bounds(whole=1, host=1, unknown=0, kept=0)
+    async with serving(shares=Shares(connections=bounds)) as server:
         for _ in range(50):
             socket.create_connection(("127.0.0.1", server.port), WAIT).close()
         robot = await server.connect("127.0.0.2")

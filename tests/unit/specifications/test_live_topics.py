@@ -23,8 +23,8 @@ LIVE: dict[str, dict[str, LiveType]] = {"/chatter": {"/talker": LiveType("std_ms
 def judged(
     live: dict[str, dict[str, LiveType]], *, shadow: Collection[str] = (), forced: bool = False
 ) -> tuple[list[str], list[str]]:
-    found = judge_topics(CODE, CheckedSpecifications(), live, shadow=shadow, forced=forced)
-    return found.conflicts, found.warnings
+    findings = judge_topics(CODE, CheckedSpecifications(), live, shadow=shadow, forced=forced)
+    return findings.conflicts, findings.warnings
 
 
 def test_a_fitting_type_is_not_a_finding() -> None:
@@ -94,8 +94,8 @@ def held(
 ) -> tuple[list[str], list[str]]:
     present, coming = (check(Sources({"d.rv": one}), ()) for one in (before, text))
     given: dict[str, Any] = {"acting": ["deadman"], "moved": (), "hold": False} | how
-    found = judge_holds(coming, present, live, **given)
-    return found.conflicts, found.warnings
+    findings = judge_holds(coming, present, live, **given)
+    return findings.conflicts, findings.warnings
 
 
 def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:

@@ -59,15 +59,15 @@ def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
 
 
 def columns_of(script: str) -> dict[str, list[tuple[str, str, int, int]]]:
-    found: dict[str, list[tuple[str, str, int, int]]] = {}
+    columns: dict[str, list[tuple[str, str, int, int]]] = {}
     with contextlib.closing(sqlite3.connect(":memory:")) as connection:
         connection.executescript(script)
         for table, *column in connection.execute(
             'SELECT t.name, c.name, c.type, c."notnull", c.pk FROM sqlite_master AS t'
             " JOIN pragma_table_info(t.name) AS c WHERE t.type = 'table' ORDER BY t.name, c.cid"
         ):
-            found.setdefault(table, []).append((column[0], column[1], column[2], column[3]))
-    return found
+            columns.setdefault(table, []).append((column[0], column[1], column[2], column[3]))
+    return columns
 
 
 def test_the_tables_of_a_released_version_keep_their_columns() -> None:

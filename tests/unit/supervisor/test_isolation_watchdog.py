@@ -383,7 +383,7 @@ async def test_open_ports_of_the_machine_are_an_alarm_until_they_are_closed_agai
     assert isolation.open_since == pytest.approx([began, began + 1], abs=0.2)
 
     def alarm() -> str:
-        (report,) = [one.report for one in watchdog.news() if isinstance(one, FirewallReported)]
+        (report,) = [message.report for message in watchdog.news() if isinstance(message, FirewallReported)]
         return str(report.removed)
 
     assert alarm().startswith("apply them again; nft removed 1 rule")

@@ -14,7 +14,7 @@ def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.
 
     monkeypatch.setattr(pwd, "getpwnam", unknown)
     accounts = {user: account_of(user) for user in NUMERIC_IDS}
-    assert {user: (one.uid, one.gid) for user, one in accounts.items()} == {
+    assert {user: (account.uid, account.gid) for user, account in accounts.items()} == {
         "rosrv": (61011, 61011),
         "rosmaster": (61012, 61012),
         "rosrv-relay": (61013, 61013),

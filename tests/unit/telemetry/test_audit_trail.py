@@ -38,10 +38,10 @@ def trail(log: AuditLog, *, deny: bool) -> AuditTrail:
 
 def test_errors_do_not_reveal_the_path_of_the_log() -> None:
     """While the log cannot be written, requests are denied, and a node does not learn the cause."""
-    one = trail(log_of(), deny=True)
-    assert one.obstacle == NOT_RECORDED
+    audit_trail = trail(log_of(), deny=True)
+    assert audit_trail.obstacle == NOT_RECORDED
     assert "/" not in NOT_RECORDED
-    assert asyncio.run(one.durable()) is not None
+    assert asyncio.run(audit_trail.durable()) is not None
 
 
 @pytest.mark.parametrize("failed", [None, "full"])
@@ -54,46 +54,46 @@ def test_changes_go_on_without_the_log_where_allowed(failed: str | None) -> None
 
 def test_refusals_of_unknown_hosts_are_marked() -> None:
     log = log_of()
-    one = trail(log, deny=True)
-    one.happened("limit exceeded", "too much", decision="deny", host=UNKNOWN)
-    one.happened("limit exceeded", "too much", decision="deny", host=GUEST)
-    one.happened("rest call", "", decision="allow", host=UNKNOWN)
-    one.happened("connection closed", "", host=UNKNOWN)
+    audit_trail = trail(log, deny=True)
+    audit_trail.happened("limit exceeded", "too much", decision="deny", host=UNKNOWN)
+    audit_trail.happened("limit exceeded", "too much", decision="deny", host=GUEST)
+    audit_trail.happened("rest call", "", decision="allow", host=UNKNOWN)
+    audit_trail.happened("connection closed", "", host=UNKNOWN)
     assert [record.unknown for record in log.records] == [True, False, False, False]
     assert [record.detail.get("unknown_host", False) for record in log.records] == [True, False, False, False]
 
 
 def test_an_event_has_the_severity_of_the_registry() -> None:
     log = log_of()
-    one = trail(log, deny=True)
-    one.happened("tunnel refused", "no certificate")
-    one.happened("limit exceeded", "no room", severity=Severity.ALARM)
-    one.happened("reconciled", "")
+    audit_trail = trail(log, deny=True)
+    audit_trail.happened("tunnel refused", "no certificate")
+    audit_trail.happened("limit exceeded", "no room", severity=Severity.ALARM)
+    audit_trail.happened("reconciled", "")
     assert [record.severity for record in log.records] == [Severity.WARNING, Severity.ALARM, Severity.INFO]
 
 
 def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
     log = log_of()
-    one = trail(log, deny=True)
-    one.happened("connection opened", "", host=GUEST)
-    one.happened("malformed", "x" * AUDIT_BYTES.bounds.host, host=GUEST)
-    one.happened("connection opened", "", host=GUEST)
-    one.happened("limit exceeded", "", host=GUEST, decision="deny")
-    one.happened("connection opened", "", host="10.0.0.1")
-    one.happened("host blocked", "", host=GUEST, whole=True)
+    audit_trail = trail(log, deny=True)
+    audit_trail.happened("connection opened", "", host=GUEST)
+    audit_trail.happened("malformed", "x" * AUDIT_BYTES.bounds.host, host=GUEST)
+    audit_trail.happened("connection opened", "", host=GUEST)
+    audit_trail.happened("limit exceeded", "", host=GUEST, decision="deny")
+    audit_trail.happened("connection opened", "", host="10.0.0.1")
+    audit_trail.happened("host blocked", "", host=GUEST, whole=True)
     assert [record.folds for record in log.records] == [False, False, True, False, False, False]
-    assert GUEST in one.owing(GUEST)
+    assert GUEST in audit_trail.owing(GUEST)
 
 
 def test_details_of_features_are_added_to_a_record() -> None:
     log = log_of()
-    one = trail(log, deny=False)
-    one.add_details(lambda event, *_: {"kept": f"in {event}"})
+    audit_trail = trail(log, deny=False)
+    audit_trail.add_details(lambda event, *_: {"kept": f"in {event}"})
     for severity in (Severity.NOTICE, Severity.INFO):
-        one.happened(
+        audit_trail.happened(
             "message dropped", "too fast", severity=severity, host="10.0.0.9", more={"kept": "forged"}
         )
-    one.happened("malformed", "no XML", decision="deny", host="10.0.0.9")
+    audit_trail.happened("malformed", "no XML", decision="deny", host="10.0.0.9")
     assert [record.detail["kept"] for record in log.records] == [
         "in message dropped",
         "forged",
@@ -108,18 +108,18 @@ def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
         log.records.clear()
 
     log = log_of(None, correct)
-    one = trail(log, deny=True)
-    while not one.owing(GUEST):
-        one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
-    assert asyncio.run(one.still_owing(GUEST)) == ""
+    audit_trail = trail(log, deny=True)
+    while not audit_trail.owing(GUEST):
+        audit_trail.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
+    assert asyncio.run(audit_trail.still_owing(GUEST)) == ""
 
 
 def test_records_that_are_written_are_owed() -> None:
     log = log_of()
-    one = trail(log, deny=True)
-    while not one.owing(GUEST):
-        one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
-    assert "bytes of audit records" in asyncio.run(one.still_owing(GUEST))
+    audit_trail = trail(log, deny=True)
+    while not audit_trail.owing(GUEST):
+        audit_trail.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
+    assert "bytes of audit records" in asyncio.run(audit_trail.still_owing(GUEST))
 
 
 @pytest.mark.parametrize("event", [*EVENTS, "decision"])
@@ -127,28 +127,28 @@ def test_records_that_are_written_are_owed() -> None:
 def test_each_record_of_a_denial_is_counted_and_no_other(event: str, host: str | None) -> None:
     """A record of several denials, such as a relay's, counts all of them. The end of a right denies none."""
     log = log_of()
-    one = trail(log, deny=True)
+    audit_trail = trail(log, deny=True)
     refuses = event != "revoked"
     for number, decision in enumerate((None, "allow", "would deny", "ask", "deny"), 1):
-        before = one.meter.denied.counts()
-        one.happened(event, "why", decision=decision, host=host, resource="/t", count=number)
-        assert (one.meter.denied.counts() != before) == (refuses and decision == "deny")
-    denied = {key: count for key, count in one.meter.decisions.items() if key[1] == "deny"}
+        before = audit_trail.meter.denied.counts()
+        audit_trail.happened(event, "why", decision=decision, host=host, resource="/t", count=number)
+        assert (audit_trail.meter.denied.counts() != before) == (refuses and decision == "deny")
+    denied = {key: count for key, count in audit_trail.meter.decisions.items() if key[1] == "deny"}
     assert denied == {("other", "deny"): 5}
-    assert one.meter.denied_hosts.counts() == {"" if host in {None, UNKNOWN} else host: 5}
+    assert audit_trail.meter.denied_hosts.counts() == {"" if host in {None, UNKNOWN} else host: 5}
     most = f"{host or 'a caller without an address'} was denied other /t, 5 times"
-    assert one.meter.most_denied() == (most if refuses else "")
+    assert audit_trail.meter.most_denied() == (most if refuses else "")
 
 
 @pytest.mark.parametrize("held", [False, True])
 def test_a_call_that_waits_for_an_approval_is_not_a_denial(*, held: bool) -> None:
     log = log_of()
-    one = trail(log, deny=True)
-    one.decided(Asker(GUEST, "/n", 0), "c", "call", "/home", Decision(False, None, "why", held=held))
+    audit_trail = trail(log, deny=True)
+    audit_trail.decided(Asker(GUEST, "/n", 0), "c", "call", "/home", Decision(False, None, "why", held=held))
     word = "ask" if held else "deny"
     assert log.records[0].decision == word
-    assert one.meter.decisions == {("call", word): 1}
-    assert one.meter.denied.counts() == ({} if held else {"call": 1})
+    assert audit_trail.meter.decisions == {("call", word): 1}
+    assert audit_trail.meter.denied.counts() == ({} if held else {"call": 1})
 
 
 def test_a_flood_of_requests_holds_few_names() -> None:

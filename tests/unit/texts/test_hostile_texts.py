@@ -253,10 +253,10 @@ def tickets(text: str) -> None:
 def searches(text: str) -> None:
     wanted = FleetFilter(None, Filter(resource=text, caller_id=text))
     try:
-        found = search_statement(wanted, SearchCursor(1, text, text), 10, [text])
+        statement = search_statement(wanted, SearchCursor(1, text, text), 10, [text])
     except FilterError:
         return
-    assert found.text.count("%s") == len(found.values) and "DROP" not in found.text
+    assert statement.text.count("%s") == len(statement.values) and "DROP" not in statement.text
 
 
 FEEDS: dict[str, Feed | str] = {

@@ -24,14 +24,14 @@ Ends = Tuple[str, int, str, int]  # of a connection: the own address and port, t
 def sockets_with(
     addresses: Set[str], tables: List[str], states: Tuple[str, ...] = _ESTABLISHED
 ) -> List[Ends]:
-    found = []
+    sockets = []
     for line in [line for table in tables for line in table.splitlines()[1:]]:
         fields = line.split()
         if fields[3] in states:
             (own, own_port), (peer, peer_port) = (_end(fields[1]), _end(fields[2]))
             if peer in addresses:
-                found.append((own, own_port, peer, peer_port))
-    return found
+                sockets.append((own, own_port, peer, peer_port))
+    return sockets
 
 
 def _end(text: str) -> Tuple[str, int]:

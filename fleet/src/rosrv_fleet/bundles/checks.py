@@ -15,7 +15,7 @@ def findings_of(contents: BundleContents) -> list[str]:
 
     The policy may only name hosts whose addresses hosts.yaml declares. The site's signatures are left to the robots.
     """
-    found: list[str] = []
+    findings: list[str] = []
     hosts = {}
     try:
         declared = parse_declared(contents.hosts, "hosts.yaml")
@@ -25,14 +25,14 @@ def findings_of(contents: BundleContents) -> list[str]:
             if host.address is not None
         }
     except DeclaredHostsError as error:
-        found.append(str(error))
+        findings.append(str(error))
     try:
         known = PolicyContext(hosts=hosts, cases_file="policy.ini.tests.yaml", cases=contents.cases)
         judge(contents.policy, "policy.ini", known).accept()
     except PolicyError as error:
-        found += [str(finding) for finding in error.findings]
+        findings += [str(finding) for finding in error.findings]
     try:
         check(Sources(contents.files, contents.definitions, contents.signatures), [])
     except SpecificationsRefusedError as error:
-        found += error.findings
-    return found
+        findings += error.findings
+    return findings

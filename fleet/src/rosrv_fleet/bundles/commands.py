@@ -233,10 +233,10 @@ def _split(place: str) -> tuple[str, str]:
 
 def _ring(text: str) -> Ring:
     """Parse `NAME=ROBOT,…`, or `NAME=PERCENT%`, with a wait such as `+1h`. Raises `TermsError`."""
-    found = _RING.fullmatch(text)
-    if found is None:
+    match = _RING.fullmatch(text)
+    if match is None:
         raise TermsError(f"{text[:80]!r} is not a ring, for example canary=arm-1,arm-2 or rest=100%+4h")
-    name, percent, robots, count, unit = found.groups()
+    name, percent, robots, count, unit = match.groups()
     after = int(count or 0) * _UNITS[unit or "s"]
     return Ring(name, robots.split(",") if robots else [], int(percent or 0), after)
 

@@ -73,16 +73,16 @@ class KeyFolder:
 
     def signers(self, role: str, keyids: Collection[str]) -> list[CryptoSigner]:
         """Return the role's keys with these ids. Raises `KeyFileError` if the role has none of them."""
-        found = []
+        signers = []
         for path in sorted(self.folder.glob("*.pem")):
             name = _FILE.fullmatch(path.name)
             if name is not None and name[1] == role and any(keyid.startswith(name[2]) for keyid in keyids):
-                found.append(self._load(path))
-        if not found:
+                signers.append(self._load(path))
+        if not signers:
             raise KeyFileError(
                 f"{self.folder} has no key of role {role}: give its folder with --keys{_if_lost(role)}"
             )
-        return found
+        return signers
 
     def _load(self, path: Path) -> CryptoSigner:
         if path not in self._signers:

@@ -347,19 +347,19 @@ def evidence_page(collector: Collector, asked: Mapping[str, str], *, may_get: bo
     )
 
 
-def _bundle(one: StoredEvidence, *, may_get: bool) -> str:
-    name = one.id[:12]
+def _bundle(evidence: StoredEvidence, *, may_get: bool) -> str:
+    name = evidence.id[:12]
     return row(
         _BUNDLE_COLUMNS,
         (
-            link("/evidence", one.robot, robot=one.robot),
-            *(text(local_time(at)) for at in (one.since, one.until)),
-            text(one.recording),
-            f"{one.records:,}",
-            f"{one.bytes:,}",
-            f"{one.collected:,} of {one.checkpoints:,} are collected",
-            f"{moment(one.added / 10**9)} by {text(one.by)}",
-            link(f"/v1/evidence/{one.id}", name) if may_get else text(name),
+            link("/evidence", evidence.robot, robot=evidence.robot),
+            *(text(local_time(at)) for at in (evidence.since, evidence.until)),
+            text(evidence.recording),
+            f"{evidence.records:,}",
+            f"{evidence.bytes:,}",
+            f"{evidence.collected:,} of {evidence.checkpoints:,} are collected",
+            f"{moment(evidence.added / 10**9)} by {text(evidence.by)}",
+            link(f"/v1/evidence/{evidence.id}", name) if may_get else text(name),
         ),
     )
 

@@ -64,10 +64,10 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
     @router.get("/{site}/{group}")
     async def one(site: str, group: str, _who: reader) -> dict[str, Any]:
         """Return a group's last rollout, its robots and its earlier rollouts."""
-        place = _group(service, site, group)
-        history = await _answer(asyncio.to_thread(service.store.history, place, _HISTORY))
-        robots, conditions = service.robots.get(place, {}), service.conditions(place)
-        return group_state(service, place) | {
+        robot_group = _group(service, site, group)
+        history = await _answer(asyncio.to_thread(service.store.history, robot_group, _HISTORY))
+        robots, conditions = service.robots.get(robot_group, {}), service.conditions(robot_group)
+        return group_state(service, robot_group) | {
             "robots": [
                 {"name": name, "condition": conditions[name].kind, "condition_why": conditions[name].why,
                  **msgspec.structs.asdict(seen)}
@@ -94,16 +94,16 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
     @router.post("/{site}/{group}/stop")
     async def stop(site: str, group: str, who: changer) -> dict[str, Any]:
         """Stop the running rollout: no other robot gets the bundle."""
-        place = _group(service, site, group)
-        await _answer(service.stop(place, who))
-        return group_state(service, place)
+        robot_group = _group(service, site, group)
+        await _answer(service.stop(robot_group, who))
+        return group_state(service, robot_group)
 
     @router.post("/{site}/{group}/revert")
     async def revert(site: str, group: str, who: changer) -> dict[str, Any]:
         """Give all robots the bundle that preceded the last rollout."""
-        place = _group(service, site, group)
-        await _answer(service.revert(place, who))
-        return group_state(service, place)
+        robot_group = _group(service, site, group)
+        await _answer(service.revert(robot_group, who))
+        return group_state(service, robot_group)
 
     return router
 

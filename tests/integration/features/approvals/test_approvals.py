@@ -69,9 +69,9 @@ def agent(robot: Host, *frames: dict[str, Any], answer: str) -> dict[str, Any]:
 
 
 def number_in(text: str) -> str:
-    found = re.search(r"held for approval ([0-9]+); ask the operator, then repeat; expires in [0-9]+ s", text)
-    assert found, text
-    return found[1]
+    match = re.search(r"held for approval ([0-9]+); ask the operator, then repeat; expires in [0-9]+ s", text)
+    assert match, text
+    return match[1]
 
 
 def test_a_call_is_held_approved_used_once_and_held_again(

@@ -58,10 +58,10 @@ class Viewer:
             while True:
                 match json.loads(self._client.recv(0)):
                     case {"op": "advertise", "channels": channels}:
-                        self._announced |= {one["id"]: one["topic"] for one in channels}
+                        self._announced |= {channel["id"]: channel["topic"] for channel in channels}
                         self._looked = True
                     case {"op": "advertiseServices", "services": services}:
-                        self._announced |= {one["id"]: one["name"] for one in services}
+                        self._announced |= {service["id"]: service["name"] for service in services}
                     case {"op": "unadvertise", "channelIds": gone} | {
                         "op": "unadvertiseServices",
                         "serviceIds": gone,

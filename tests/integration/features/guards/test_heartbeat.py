@@ -148,8 +148,8 @@ Fault = Callable[[Beating], contextlib.AbstractContextManager[float]]
 
 def relays(beating: Beating) -> list[int]:
     def both() -> list[int] | None:
-        found = beating.appliance.pids("relay")
-        return found if len(found) == 2 else None
+        pids = beating.appliance.pids("relay")
+        return pids if len(pids) == 2 else None
 
     return eventually(both, "both relays run")
 

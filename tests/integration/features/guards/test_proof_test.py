@@ -65,7 +65,7 @@ def test_copies_act_and_the_stop_reaches_the_driver_of_a_standing_robot(
         eventually(lambda: guards(own_appliance)["deadman"]["times"], "the guards judge commands")
         states, heard = guards(own_appliance), counted(base)
         rows = {one["guard"]: one for one in map(json.loads, test().splitlines())}
-        assert {name: one["test"]["outcome"] for name, one in rows.items()} == ACTS
+        assert {name: row["test"]["outcome"] for name, row in rows.items()} == ACTS
         for one in rows.values():
             reached = {row["node"]: row for row in one["test"]["reached"]}
             assert reached["/base"]["driver"]
@@ -74,7 +74,7 @@ def test_copies_act_and_the_stop_reaches_the_driver_of_a_standing_robot(
         assert base.seen(event="moves") == []
         state = values(own_appliance, "estop")
         assert state["buttons"] == ["/button"] and "/test_robot" not in str(state)
-        assert {name: one["stops"] for name, one in guards(own_appliance).items()} == {
+        assert {name: guard["stops"] for name, guard in guards(own_appliance).items()} == {
             name: one["stops"] for name, one in states.items()
         }
         records = own_appliance.recorded(event="guard tested", count=3)
@@ -90,7 +90,7 @@ def test_copies_act_and_the_stop_reaches_the_driver_of_a_standing_robot(
         assert "not in force" in test("limit", status=1)
         own_appliance.stop()
         own_appliance.start()
-        kept = {name: one["tested"]["outcome"] for name, one in guards(own_appliance).items()}
+        kept = {name: guard["tested"]["outcome"] for name, guard in guards(own_appliance).items()}
         assert kept == ACTS
         manual = own_appliance.rosrv("guard", "manual").stdout
         assert manual.count("acknowledged the stop") == len(ACTS)

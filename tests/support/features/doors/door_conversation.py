@@ -85,11 +85,11 @@ class DoorConversation:
     async def say(self, line: str) -> list[str]:
         self._begin()
         text = re.sub(r"«(.+?)\*(\d+)»", lambda found: found[1] * int(found[2]), line)
-        found = re.fullmatch(r"(\d+) times in (\S+) s: (.*)", text)
-        if found is not None:
-            for number in range(int(found[1])):
-                await self._act(found[3].replace("{n}", str(number)))
-                await asyncio.sleep(float(found[2]) / int(found[1]))
+        match = re.fullmatch(r"(\d+) times in (\S+) s: (.*)", text)
+        if match is not None:
+            for number in range(int(match[1])):
+                await self._act(match[3].replace("{n}", str(number)))
+                await asyncio.sleep(float(match[2]) / int(match[1]))
         else:
             await self._act(text)
         await asyncio.sleep(0 if " is disconnected: " in line else _SETTLED)
@@ -100,7 +100,7 @@ class DoorConversation:
         for one in self._world.types.take_differing():
             publishers = sorted(" ".join(part) for part in (one.earlier, one.later))
             self._seen.append(f"door reports two definitions of {one.name}: {' and '.join(publishers)}")
-        return (_counted if found is None else _folded)(_without_ids(_by_client(self._seen)))
+        return (_counted if match is None else _folded)(_without_ids(_by_client(self._seen)))
 
     def _begin(self) -> None:
         self._seen.clear()
@@ -328,7 +328,7 @@ class DoorConversation:
 
 def _by_client(effects: list[str]) -> Iterator[str]:
     """Order frames that several clients get at one time by the clients, because the door serves those in any order."""
-    for _time, same in groupby(effects, key=lambda one: found[1] if (found := _FRAME.match(one)) else one):
+    for _time, same in groupby(effects, key=lambda one: match[1] if (match := _FRAME.match(one)) else one):
         yield from sorted(same, key=lambda one: one.split(" < ")[0])
 
 

@@ -359,8 +359,8 @@ def shadow(robot: GuardedRobot) -> None:
 def set_value(robot: GuardedRobot) -> None:
     """Set the first parameter of each guard, to the value that it has."""
     for name, preset in robot.presets.items():
-        for one in preset.parameters[:1] if preset.name in PRESETS else ():
-            robot.ask(GuardSet(name, {one.name: one.default}, hold=True))
+        for parameter in preset.parameters[:1] if preset.name in PRESETS else ():
+            robot.ask(GuardSet(name, {parameter.name: parameter.default}, hold=True))
 
 
 def malformed(robot: GuardedRobot) -> None:

@@ -77,15 +77,15 @@ class StandbySite:
         self._follower: Process | None = None
         self.appliances: dict[str, Appliance] = {}
         for name, address in ADDRESSES.items():
-            one = Appliance(
+            appliance = Appliance(
                 lab.host(name, f"{address}/24"),
                 policy=policy,
                 options=("--listen", "0.0.0.0:11311", *options),
                 **more,
             )
-            one.state.mkdir(mode=0o711)
-            save_membership(path_of(one.state), members[name])
-            self.appliances[name] = one
+            appliance.state.mkdir(mode=0o711)
+            save_membership(path_of(appliance.state), members[name])
+            self.appliances[name] = appliance
 
     def command(self, *words: str, settings: Path | None = None) -> list[str]:
         program = (
@@ -145,10 +145,10 @@ class StandbySite:
         one.process.wait_for(lambda event: event.get("event") in {"standby", "ready"}, timeout=2 * LIMIT)
         return one.process
 
-    def _up(self, one: Appliance) -> list[str]:
+    def _up(self, appliance: Appliance) -> list[str]:
         return [
-            ROSRV, "up", "--json", "--isolation", one.isolation, "--state", str(one.state), "--policy",
-            str(one.policy_file), *one.options,
+            ROSRV, "up", "--json", "--isolation", appliance.isolation, "--state", str(appliance.state), "--policy",
+            str(appliance.policy_file), *appliance.options,
         ]  # fmt: skip
 
     def holder(self) -> str:

@@ -43,19 +43,19 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 
 def until_able(site: StandbySite) -> None:
-    for one in site.appliances.values():
-        eventually(lambda one=one: one.rosrv("standby", "status"), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
+    for appliance in site.appliances.values():
+        eventually(lambda one=appliance: one.rosrv("standby", "status"), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
 
 
 def test_a_standby_that_the_witness_does_not_answer(site: StandbySite) -> None:
     until_able(site)
     with site.without_link((ADDRESSES["b"], ROBOT)):
-        for one in site.appliances.values():
+        for appliance in site.appliances.values():
             eventually(
-                lambda one=one: one.rosrv("standby", "status", check=False).returncode == 1,  # type: ignore[misc]  # mypy infers no type for a lambda's default
+                lambda one=appliance: one.rosrv("standby", "status", check=False).returncode == 1,  # type: ignore[misc]  # mypy infers no type for a lambda's default
                 site.story,
             )
-            done = one.rosrv("standby", "switch", check=False)
+            done = appliance.rosrv("standby", "switch", check=False)
             assert (done.returncode, "does not answer" in done.stderr) == (1, True), done
     assert site.lease.read().epoch == 2
 
@@ -130,7 +130,7 @@ def test_two_nearly_full_disks(site: StandbySite, robot: StandbyRobot) -> None:
 
     until_able(site)
     epoch, (first, second) = site.lease.read().epoch, site.pair()
-    states = {name: one.state for name, one in site.appliances.items()}
+    states = {name: appliance.state for name, appliance in site.appliances.items()}
     with filled(states[second], _LITTLE):
         reports(first, "are free on its disk|disk is full")
         with filled(states[first], _LITTLE):

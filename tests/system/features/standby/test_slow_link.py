@@ -8,8 +8,8 @@ from tests.support.waiting import eventually
 LACKS = "so it cannot take over; check the disk and the load of its machine"
 
 
-def fails(one: Appliance) -> str:
-    done = one.rosrv("standby", "status", check=False)
+def fails(appliance: Appliance) -> str:
+    done = appliance.rosrv("standby", "status", check=False)
     return " ".join(done.stdout.split()) if done.returncode == 1 else ""
 
 

@@ -71,10 +71,10 @@ def test_a_power_cut_of_the_active_appliance(site: StandbySite, robot: StandbyRo
     assert site.holder() == passive
 
 
-def used(one: Appliance) -> Counter[str]:
+def used(appliance: Appliance) -> Counter[str]:
     """Return how much of each quota is in use, but for bytes."""
     return Counter(
-        {row["resource"]: row["used"] for row in one.rows("limits") if "bytes" not in row["resource"]}
+        {row["resource"]: row["used"] for row in appliance.rows("limits") if "bytes" not in row["resource"]}
     )
 
 
@@ -188,26 +188,26 @@ def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
     site.until_both_in_sync()
 
 
-def rest_of(one: Appliance, token: str) -> Callable[[str], Answer]:
-    assert isinstance(one.host, Host)
-    host = one.host
-    rest = Rest(REST, token, one.state / "api" / "certificate.pem")
+def rest_of(appliance: Appliance, token: str) -> Callable[[str], Answer]:
+    assert isinstance(appliance.host, Host)
+    host = appliance.host
+    rest = Rest(REST, token, appliance.state / "api" / "certificate.pem")
 
     def get(path: str) -> Answer:
         return host.run(partial(rest.get, path))
 
-    eventually(lambda: get("/v1/status").status == 200, one.story)
+    eventually(lambda: get("/v1/status").status == 200, appliance.story)
     return get
 
 
-def learn_of_the_pause(one: Appliance, get: Callable[[str], Answer]) -> None:
+def learn_of_the_pause(appliance: Appliance, get: Callable[[str], Answer]) -> None:
     began = time.monotonic()
     for verb in (("status",), ("standby", "status"), ("policy", "show")):
-        done = one.rosrv(*verb, check=False)
+        done = appliance.rosrv(*verb, check=False)
         assert (done.returncode, PAUSED in done.stderr) == (1, True), done
     health = subprocess.run(
         [sys.executable, "-m", "appliance.cli.healthy"],
-        env={**os.environ, "ROSRV_STATE": str(one.state)},
+        env={**os.environ, "ROSRV_STATE": str(appliance.state)},
         capture_output=True,
         text=True,
         check=False,

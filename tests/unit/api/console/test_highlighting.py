@@ -8,6 +8,6 @@ LANGUAGES = Path(appliance.api.__file__).parent / "console" / "js" / "parts" / "
 
 
 def test_every_logic_is_highlighted() -> None:
-    found = re.search(r'KEYWORDS = new Set\("([^"]+)"', LANGUAGES.read_text(encoding="utf-8"))
-    assert found is not None
-    assert LOGICS.keys() - set(found[1].split()) == set()
+    match = re.search(r'KEYWORDS = new Set\("([^"]+)"', LANGUAGES.read_text(encoding="utf-8"))
+    assert match is not None
+    assert LOGICS.keys() - set(match[1].split()) == set()

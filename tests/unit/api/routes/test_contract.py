@@ -231,9 +231,9 @@ def _absent(written: Any, shown: Any, where: str) -> list[str]:
 @pytest.mark.complete
 def test_examples_have_only_fields_of_their_kinds(contract: dict[str, Any]) -> None:
     shown = {
-        kind: one["examples"][0]
-        for kind, one in contract["components"]["schemas"].items()
-        if "examples" in one
+        kind: schema["examples"][0]
+        for kind, schema in contract["components"]["schemas"].items()
+        if "examples" in schema
     }
     absent = [
         line for kind, one in EXAMPLES.items() if kind in shown for line in _absent(one, shown[kind], kind)

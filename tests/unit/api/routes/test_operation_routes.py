@@ -334,7 +334,7 @@ REJECTIONS = (
 
 @pytest.mark.parametrize("request_", REQUESTS[::9], ids=IDS[::9])
 @pytest.mark.parametrize(
-    ("error", "status", "kind"), REJECTIONS, ids=[type(one[0]).__name__ for one in REJECTIONS]
+    ("error", "status", "kind"), REJECTIONS, ids=[type(rejection[0]).__name__ for rejection in REJECTIONS]
 )
 def test_a_rejection_by_control_is_a_problem(
     error: Exception, status: int, kind: str, request_: tuple[str, str, Any]
@@ -356,10 +356,10 @@ def test_a_rejection_by_control_is_a_problem(
     assert (record["decision"], record["status"]) == ("deny", status)
 
 
-BODIES = [one for one in REQUESTS if one[2] is not None]
+BODIES = [request for request in REQUESTS if request[2] is not None]
 
 
-@pytest.mark.parametrize("sent", BODIES, ids=[f"{one[0]} {one[1]} {n}" for n, one in enumerate(BODIES)])
+@pytest.mark.parametrize("sent", BODIES, ids=[f"{body[0]} {body[1]} {n}" for n, body in enumerate(BODIES)])
 def test_an_invalid_body_changes_nothing(sent: tuple[str, str, Any]) -> None:
     method, target, body = sent
     role = role_for(target)
@@ -531,9 +531,9 @@ def test_routes_written_by_hand_are_for_these_roles() -> None:
     ]
     assert not wrong, "\n".join(wrong)
     assert routes().keys() >= expected.keys()
-    for one in OPERATIONS:
-        if one.path and f"{one.method} {one.path}" not in named:
-            assert by_hand[f"{one.method} {one.path}"] == {one.role}, one
+    for operation in OPERATIONS:
+        if operation.path and f"{operation.method} {operation.path}" not in named:
+            assert by_hand[f"{operation.method} {operation.path}"] == {operation.role}, operation
 
 
 def roles_of(dependant: Any) -> Iterator[str | None]:
@@ -561,7 +561,7 @@ def test_a_role_is_judged_before_the_request() -> None:
 def test_every_order_has_its_way() -> None:
     made = {type(ordered(method, target, body).request) for method, target, body in REQUESTS}
     require_rows(
-        (one.__name__ for one in CHANGES),
+        (change.__name__ for change in CHANGES),
         (one.__name__ for one in made),
         "REQUESTS here, as a request that makes it",
     )
@@ -634,7 +634,7 @@ def test_without_an_answer_that_makes_a_dry_run_the_operation_is_not_offered() -
 
     async def makes_it(_call: OperationCall[Any]) -> None: ...
 
-    named = [one for one in OPERATIONS if one.name]
+    named = [operation for operation in OPERATIONS if operation.name]
     assert any(one.dry_run for one in named)
     assert [one for one in named if not is_offered(one, None)] == [one for one in named if one.dry_run]
     assert all(is_offered(one, Answer(makes_it)) for one in named)

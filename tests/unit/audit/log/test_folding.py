@@ -280,7 +280,7 @@ def test_invalid_text_can_be_stored() -> None:
     assert msgspec.json.encode(key)
     assert msgspec.json.encode(folder.state(key))
     (allowed,) = [denial("/\udfff", **strange | {"decision": "allow"})]
-    assert [one.event for one in offer(folder, allowed)] == ["denials folded", "decision"]
+    assert [record.event for record in offer(folder, allowed)] == ["denials folded", "decision"]
     assert len(folder) == 0
 
 
@@ -368,7 +368,7 @@ def test_a_denial_ends_the_folding_of_reads() -> None:
     offer(folder, read("/a"), read("/a"))
     refused = read("/a", decision="deny", folds=False)
     again = read("/a")
-    assert [one.event for one in offer(folder, refused)] == ["repetitions folded", "decision"]
+    assert [record.event for record in offer(folder, refused)] == ["repetitions folded", "decision"]
     assert offer(folder, again) == [again]
 
 
@@ -423,7 +423,7 @@ def test_a_denial_of_one_own_parameter_ends_the_folding() -> None:
     again = read("/n/a")
     assert offer(folder, again) == [again]
     others = [read(f"/n/{name}", decision="deny", folds=False) for name in "de"]
-    assert [one for one in offer(folder, *others) if one.decision == "deny"] == others
+    assert [record for record in offer(folder, *others) if record.decision == "deny"] == others
 
 
 def test_lists_of_parameters_survive_a_crash() -> None:

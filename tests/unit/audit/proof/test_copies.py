@@ -75,7 +75,7 @@ def test_checkpoints_of_removed_records_contradict_nothing(
     result = verify(path, copies=copies + newer)
     assert result.ok, result.findings
     assert copies[0].sequence <= result.removed
-    gone = [one for one in copies if one.sequence < result.removed]
+    gone = [copy for copy in copies if copy.sequence < result.removed]
     assert gone
     assert kinds(verify(path, copies=gone)) == {FindingKind.PROVES_NOTHING}
 

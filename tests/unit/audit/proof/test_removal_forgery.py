@@ -75,7 +75,7 @@ def test_the_signer_and_copies_find_it_too(fresh: Path, notary: Notary) -> None:
         attacker.commit()
     assert FindingKind.REMOVAL_UNFOUNDED in kinds(verify(fresh, signer=notary.directory))
     assert FindingKind.REMOVAL_UNFOUNDED in kinds(verify(fresh, copies=copies))
-    gone = [one for one in copies if one.sequence < verify(fresh).removed]
+    gone = [copy for copy in copies if copy.sequence < verify(fresh).removed]
     assert {FindingKind.REMOVAL_UNFOUNDED, FindingKind.PROVES_NOTHING} <= kinds(verify(fresh, copies=gone))
 
 
@@ -154,7 +154,7 @@ def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
     assert (result.removed, result.removal) == (68, "unsigned")
     copies = signed_checkpoints(old)
     assert verify(old, copies=copies).ok
-    assert {one.removed for one in copies} == {None}
+    assert {copy.removed for copy in copies} == {None}
 
 
 def test_an_old_log_is_continued(old: Path) -> None:

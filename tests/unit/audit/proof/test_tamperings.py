@@ -97,9 +97,9 @@ def findings(state: Path, copies: list[SignedCheckpoint] | None = None) -> str:
         return "cannot be read"
     assert result.ok is (not result.findings)
     spans: dict[str, tuple[int, int]] = {}
-    for one in result.findings:
-        first, last = spans.get(one.kind, (one.first, one.last))
-        spans[one.kind] = min(first, one.first), max(last, one.last)
+    for finding in result.findings:
+        first, last = spans.get(finding.kind, (finding.first, finding.last))
+        spans[finding.kind] = min(first, finding.first), max(last, finding.last)
     ranges = (
         f"{kind} {first}" + f" to {last}" * (last > first) for kind, (first, last) in sorted(spans.items())
     )

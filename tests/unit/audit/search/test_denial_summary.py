@@ -50,13 +50,13 @@ def of(*records: AuditRecord, limit: int = 10) -> DenialSummary:
 
 
 def test_the_host_with_the_most_denials_is_first() -> None:
-    found = of(
+    summary = of(
         denial(1), denial(2, "10.0.0.2", rule=RULE), denial(3, "10.0.0.2", rule=RULE, caller_id="/b"),
         denial(4, "10.0.0.2", "value 7 is wrong"), denial(5, "10.0.0.2", "value 8 is wrong"),
         denial(6, "10.0.0.2", "third"), denial(7, "10.0.0.2", "third"), denial(8, "10.0.0.2", "fourth"),
     )  # fmt: skip
-    assert found.denials == 8
-    second, first = found.hosts
+    assert summary.denials == 8
+    second, first = summary.hosts
     assert (second.host, second.count, first.host, first.count) == ("10.0.0.2", 7, "10.0.0.1", 1)
     assert (second.first, second.last) == (rfc3339(BEGIN + 2 * _SECOND), rfc3339(BEGIN + 8 * _SECOND))
     assert {(reason.name, reason.count) for reason in second.reasons} == {
@@ -91,28 +91,28 @@ def test_revoked_rights_are_not_counted() -> None:
 
 
 def test_counted_repetitions_count_as_their_number() -> None:
-    found = of(
+    summary = of(
         folded(KIND, "10.0.0.1", 5, reasons={"no rule": 5}),
         folded(HOST, "10.0.0.2", 7, reasons={"busy 3": 4, "busy 4": 2, OTHERS: 1}, callers={"/x": 3, "/y": 4}),
         folded(UNKNOWN, "10.0.0.3", 2, reasons={"no rule": 2}),
     )  # fmt: skip
-    assert [(row.host, row.count) for row in found.hosts] == [
+    assert [(row.host, row.count) for row in summary.hosts] == [
         ("10.0.0.2", 7),
         ("10.0.0.1", 5),
         ("10.0.0.3", 2),
     ]
-    assert {(row.first, row.last) for row in found.hosts} == {
+    assert {(row.first, row.last) for row in summary.hosts} == {
         (rfc3339(BEGIN + 10 * _SECOND), rfc3339(BEGIN + 20 * _SECOND))
     }
-    assert found.hosts[0].reasons == [CountedName("busy 3", 6), CountedName(OTHERS, 1)]
-    assert found.hosts[0].callers == [CountedName("/y", 4), CountedName("/x", 3)]
+    assert summary.hosts[0].reasons == [CountedName("busy 3", 6), CountedName(OTHERS, 1)]
+    assert summary.hosts[0].callers == [CountedName("/y", 4), CountedName("/x", 3)]
 
 
 @pytest.mark.parametrize("scope", [ALL, ALL_UNKNOWN])
 def test_repetitions_of_many_hosts_count_for_the_hosts_that_are_named(scope: str) -> None:
-    found = of(denial(1), folded(scope, None, 100, hosts={"10.0.0.1": 60, "10.0.0.9": 10, OTHERS: 20}))
-    assert found.denials == 101
-    assert [(row.host, row.count) for row in found.hosts] == [
+    summary = of(denial(1), folded(scope, None, 100, hosts={"10.0.0.1": 60, "10.0.0.9": 10, OTHERS: 20}))
+    assert summary.denials == 101
+    assert [(row.host, row.count) for row in summary.hosts] == [
         ("10.0.0.1", 61),
         (OTHERS, 30),
         ("10.0.0.9", 10),
@@ -152,8 +152,8 @@ def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
     log.record(decision(log, decision="would deny", host="10.0.0.3"))
     settle(log)
     assert log.close() is None  # writes the summary of the repetitions
-    found = summary_of_log(log.path, Filter(), 10)
-    assert [(row.host, row.count) for row in found.hosts] == [("10.0.0.1", 30)]
+    summary = summary_of_log(log.path, Filter(), 10)
+    assert [(row.host, row.count) for row in summary.hosts] == [("10.0.0.1", 30)]
     assert len([*export(log.path, Filter(decision=("deny",)))]) < 30
     assert summary_of_log(log.path, Filter(since=clock.wall_ns() + 60 * _SECOND), 10).hosts == []
 
@@ -177,7 +177,7 @@ def test_ten_thousand_denials_take_less_than_half_a_second(make_log: MakeLog) ->
     took = []
     for _ in range(3):  # the minimum, because other processes may disturb the caches
         before = time.process_time()
-        found = summary_of_log(log.path, Filter(), 20)
+        summary = summary_of_log(log.path, Filter(), 20)
         took.append(time.process_time() - before)
     assert min(took) < 0.4
-    assert (found.denials, found.more_hosts) == (10_000, 980)
+    assert (summary.denials, summary.more_hosts) == (10_000, 980)

@@ -86,6 +86,6 @@ async def test_a_checkpoint_that_is_made_while_the_signer_connects_waits_for_ear
         log.housekeeping.attempt(log.housekeeping.seal)
         await asyncio.sleep(1)
         let_pass(log, 1)
-    found = signed_checkpoints(tmp_path / "audit.db", 0, 100)
-    assert [one.number for one in found] == [*range(1, sealed_before + 3)]
+    checkpoints = signed_checkpoints(tmp_path / "audit.db", 0, 100)
+    assert [checkpoint.number for checkpoint in checkpoints] == [*range(1, sealed_before + 3)]
     assert verify(tmp_path / "audit.db", signer=tmp_path / "signer").findings == []

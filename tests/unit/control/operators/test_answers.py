@@ -65,7 +65,7 @@ def parts(kind: Any, seen: set[Any]) -> typing.Iterator[tuple[Any, str, Any]]:
 
 
 # `RestLink` answers a challenge itself.
-ANSWERED = [one for one in REQUESTS if one is not admin.ChallengeWanted]
+ANSWERED = [request for request in REQUESTS if request is not admin.ChallengeWanted]
 
 
 def test_one_method_answers_each_request() -> None:

@@ -81,7 +81,7 @@ def test_an_acknowledgement_survives_a_restart_until_its_alarm_returns(
                 assert robot.alarms() == []
                 clock.advance(1)
             robot.fields = BAD
-            assert [bool(one.handled) for one in robot.alarms()] == [handled], start
+            assert [bool(alarm.handled) for alarm in robot.alarms()] == [handled], start
         robot.fields = GOOD
         assert robot.alarms() == []
         robot.fields = BAD
@@ -98,7 +98,7 @@ def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, 
         robot.fields = BAD
         clock.set_wall(clock.wall_ns() / 1e9 + passed)
         robot.restart()
-        assert [one.severity for one in robot.alarms()] == [severity]
+        assert [alarm.severity for alarm in robot.alarms()] == [severity]
 
 
 @pytest.mark.parametrize(("left", "severity"), [(1, "notice"), (-1, "warning")])
@@ -109,13 +109,13 @@ def test_a_clock_that_is_set_back_does_not_extend_a_silence(robot: Robot, left: 
         clock.advance(5400)
         clock.set_wall(clock.wall_ns() / 1e9 - 3600)
         clock.advance(1800 - left)
-        assert [one.severity for one in robot.alarms()] == [severity]
+        assert [alarm.severity for alarm in robot.alarms()] == [severity]
 
 
 def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
     robot.silence(3600)
     robot.silence(None)
-    assert [one.severity for one in robot.alarms()] == ["warning"]
+    assert [alarm.severity for alarm in robot.alarms()] == ["warning"]
     assert [event.partition(":")[0] for event in robot.events] == [
         "alarm silenced by ann",
         "alarm sounds again by ann",
@@ -133,7 +133,7 @@ def test_an_order_with_the_name_alone_is_for_the_alarms_that_are_present(robot: 
     robot.fields = failing("hook", "signer")
     assert order(3600.0) == {"hook": True, "signer": True}
     robot.fields = failing("hook", "recorder")
-    assert [(one.severity, one.kind) for one in robot.alarms()] == [
+    assert [(alarm.severity, alarm.kind) for alarm in robot.alarms()] == [
         ("alarm", "process-failing:recorder"), ("notice", "process-failing:hook"),
     ]  # fmt: skip
     body = asyncio.run(robot.orders.acknowledge(AlarmAcknowledge("process-failing:recorder"), "ann"))

@@ -119,9 +119,9 @@ def site(tmp_path: Path) -> Any:
 
 
 def number_in(text: str) -> int:
-    found = NUMBER.search(text)
-    assert found, text
-    return int(found[1])
+    match = NUMBER.search(text)
+    assert match, text
+    return int(match[1])
 
 
 class Held(NamedTuple):

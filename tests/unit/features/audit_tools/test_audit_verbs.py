@@ -68,8 +68,8 @@ def followed(
             raise answer
         return [checkpoint for checkpoint in answer if checkpoint.number > after]
 
-    found = _checkpoints(read, 0, follow=True)
-    return (one for several in found for one in several)
+    checkpoints = _checkpoints(read, 0, follow=True)
+    return (one for several in checkpoints for one in several)
 
 
 def test_following_checkpoints_survives_a_restart_of_the_appliance(
@@ -77,8 +77,8 @@ def test_following_checkpoints_survives_a_restart_of_the_appliance(
 ) -> None:
     one, two, three = map(checkpoint, (1, 2, 3))
     away = [NotRunningError("https://robot: the connection broke")] * 50
-    found = followed(monkeypatch, [], [one, two], *away, [one, two], [one, two, three])
-    assert list(itertools.islice(found, 3)) == [one, two, three]
+    checkpoints = followed(monkeypatch, [], [one, two], *away, [one, two], [one, two, three])
+    assert list(itertools.islice(checkpoints, 3)) == [one, two, three]
     assert capsys.readouterr().err == "rosrv: https://robot: the connection broke; trying again\n"
 
 
@@ -95,11 +95,11 @@ def test_following_checkpoints_continues_with_the_log_that_replaces_the_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     first, second = [checkpoint(number) for number in range(1, 4)], [checkpoint(1, "two")]
-    found = followed(monkeypatch, first, first, second)
-    assert list(itertools.islice(found, 4)) == [*first, *second]
+    checkpoints = followed(monkeypatch, first, first, second)
+    assert list(itertools.islice(checkpoints, 4)) == [*first, *second]
     full = [*first, checkpoint(4), checkpoint(5)]
-    found = followed(monkeypatch, first, full)
-    assert list(itertools.islice(found, 5)) == full
+    checkpoints = followed(monkeypatch, first, full)
+    assert list(itertools.islice(checkpoints, 5)) == full
 
 
 def test_every_recorded_category_is_known() -> None:

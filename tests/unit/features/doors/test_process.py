@@ -99,8 +99,8 @@ async def test_a_network_full_of_addresses_hides_no_other_host(monkeypatch: pyte
         control.give(door_link.ViewerGiven(host, "ticket"), (3,))
     await asyncio.sleep(3)
     changes = [report for report in control.reports if isinstance(report, door_link.ConnectionsChanged)]
-    assert [one.refused for one in changes if one.peer == "10.0.0.7"] == [1]
-    assert sum(one.refused for one in changes if one.peer.startswith("2001:db8::")) == 399
+    assert [change.refused for change in changes if change.peer == "10.0.0.7"] == [1]
+    assert sum(change.refused for change in changes if change.peer.startswith("2001:db8::")) == 399
     assert len(changes) < 300
     await control.end()
 

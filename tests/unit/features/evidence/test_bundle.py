@@ -254,9 +254,9 @@ def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, revi
     assert reviewer.status(tmp_path / "missing.zip") == 2
 
 
-def _longer(place: Path) -> bytes:
-    with zipfile.ZipFile(place) as archive:
-        last, end, whole = archive.infolist()[-1], archive.start_dir, place.read_bytes()
+def _longer(path: Path) -> bytes:
+    with zipfile.ZipFile(path) as archive:
+        last, end, whole = archive.infolist()[-1], archive.start_dir, path.read_bytes()
     whole = whole[:end] + b"evil" + whole[end:]
     for at, number in (
         (last.header_offset + 18, last.compress_size + 4),
@@ -516,8 +516,8 @@ def test_copied_checkpoints_show_a_rewritten_history(
     kept = tmp_path / "copies.ndjson"
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
     assert reviewer.status(bundle, "--checkpoints", kept) == 0
-    found = re.search(r"(\d+) of (\d+) checkpoints were also kept elsewhere", reviewer.said)
-    assert found and found[1] == found[2] != "0"
+    match = re.search(r"(\d+) of (\d+) checkpoints were also kept elsewhere", reviewer.said)
+    assert match and match[1] == match[2] != "0"
     for copy in copies:
         copy["hash"] = "0" * 64
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))

@@ -83,11 +83,11 @@ async def test_the_line_of_the_monitor_is_the_outcome(
     assert not site.removed() and not site.trail.records
     site.says(f"driver check: {outcome} after {seconds:.3f} s")
     await site.checks.look()
-    found = await site.checks.check_drivers(DriverCheckWanted())
-    assert (found.outcome, found.seconds, status_of(found.outcome)) == (outcome, seconds, status)
+    check = await site.checks.check_drivers(DriverCheckWanted())
+    assert (check.outcome, check.seconds, status_of(check.outcome)) == (outcome, seconds, status)
     assert site.removed()
     [row] = site.trail.rows
-    assert (row["event"], row["reason"], row["who"]) == ("driver checked", f"/cmd_vel: {found.text}", "eve")
+    assert (row["event"], row["reason"], row["who"]) == ("driver checked", f"/cmd_vel: {check.text}", "eve")
 
 
 async def test_its_monitor_is_removed_before_the_client_reads_the_outcome(site: Site) -> None:
@@ -154,8 +154,8 @@ async def test_a_disturbed_check_ends_and_its_monitor_is_removed(site: Site, dis
     await disturb(site)
     await site.checks.look()
     assert site.removed()
-    found = await site.checks.check_drivers(DriverCheckWanted())
-    assert found.outcome == "interrupted" and why in found.text and status_of(found.outcome) == 2
+    check = await site.checks.check_drivers(DriverCheckWanted())
+    assert check.outcome == "interrupted" and why in check.text and status_of(check.outcome) == 2
 
 
 async def test_a_control_that_starts_removes_the_monitor_of_the_last_one(site: Site) -> None:

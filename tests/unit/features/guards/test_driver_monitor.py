@@ -47,9 +47,9 @@ class Drive(Guarded):
     def receive(self, outcome: Outcome, at: int) -> None:
         super().receive(outcome, at)
         for line in outcome.log:
-            found = re.fullmatch(r"driver check: (\w+) after ([\d.]+) s", line.text)
-            assert found, line.text
-            self.lines.append((found[1], float(found[2])))
+            match = re.fullmatch(r"driver check: (\w+) after ([\d.]+) s", line.text)
+            assert match, line.text
+            self.lines.append((match[1], float(match[2])))
 
 
 @pytest.mark.parametrize("timeout", [120, 480, 1500])

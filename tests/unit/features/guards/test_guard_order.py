@@ -154,7 +154,7 @@ CONSEQUENCES: list[Callable[[bool], bool]] = [
 ]
 
 
-@pytest.mark.parametrize("happens", CONSEQUENCES, ids=[one.__name__ for one in CONSEQUENCES])
+@pytest.mark.parametrize("happens", CONSEQUENCES, ids=[consequence.__name__ for consequence in CONSEQUENCES])
 def test_the_wrong_order_has_its_consequence_and_phases_prevent_it(happens: Callable[[bool], bool]) -> None:
     assert happens(False)
     assert not happens(True)
@@ -174,6 +174,6 @@ def test_each_row_of_the_table_has_its_test_and_the_phases_keep_it() -> None:
     for written in ([*PRESETS], [*reversed(PRESETS)]):
         texts = {f"{name}.rv": PRESETS[name].text for name in written}
         compiled = compiled_from(texts, DEFINITIONS, lints=False, without_code=texts)
-        places = {one.name: place for place, one in enumerate(compiled.specifications)}
+        places = {specification.name: place for place, specification in enumerate(compiled.specifications)}
         for first, then in (pair for row in PRECEDENCES for pair in product(row.first, row.then)):
             assert places[first] < places[then]

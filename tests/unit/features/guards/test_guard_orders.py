@@ -308,7 +308,7 @@ def alarms_of(orders: GuardOrders) -> list[str]:
     orders.look()
     state = orders.state()
     assert state is not None
-    return [one.text for one in GUARDS_VIEW.states[0].alarms(state) if one.kind == "guard-late:fence"]
+    return [alarm.text for alarm in GUARDS_VIEW.states[0].alarms(state) if alarm.kind == "guard-late:fence"]
 
 
 async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: SpecificationManager) -> None:
@@ -318,8 +318,8 @@ async def test_a_late_guard_is_an_alarm_for_a_minute_with_one_record(monitors: S
     assert alarms_of(orders) == []
     for second in range(1, 4):
         timed(monitors, 100 + second, late=second, latest=0.04 + second / 1000)
-        found = alarms_of(orders)
-    assert found == [
+        alarms = alarms_of(orders)
+    assert alarms == [
         "the guard fence acted late 3 times in the last minute (limit 20 ms, longest since its relay began 43.0 ms):"
         " rosrv guard list"
     ]

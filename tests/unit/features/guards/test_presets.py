@@ -94,7 +94,7 @@ def test_a_load_with_other_topics_makes_the_guard_that_a_text_with_them_makes(pr
             )
         )  # fmt: skip
         [code], [wanted] = loaded.specifications, made.specifications
-        assert {one.name for one in code.given_topics} == others.keys()
+        assert {topic.name for topic in code.given_topics} == others.keys()
         assert [event.topic for event in code.events] == [event.topic for event in wanted.events]
         assert (code.acts_on, [safe.topic for safe in code.safes]) == (
             wanted.acts_on, [safe.topic for safe in wanted.safes],

@@ -141,19 +141,19 @@ def test_a_guard_hears_some_command_of_each_driver_or_a_sentence_says_that_it_do
             merged = in_one_process({*topic.publishers, *RobotGraph(graph).ends(topic)}, graph)
         found, read = advice(merged), RobotGraph(merged)
         for topic in read.topics:
-            if topic.name in {one.topics["command"] for one in found.suggestions}:
+            if topic.name in {suggestion.topics["command"] for suggestion in found.suggestions}:
                 own = read.ends(topic).intersection(topic.publishers)
                 assert {*topic.publishers} - own or not own, topic
                 for node in own:
                     assert any(
                         f"{node} also publishes {topic.name} to itself" in one for one in found.left_out
                     )
-        sent = [one for one in read.velocities if "/manager" in one.publishers]
+        sent = [velocity for velocity in read.velocities if "/manager" in velocity.publishers]
         if not any({*one.subscribers} - {"/manager"} for one in sent):
             heard = {
                 one.name for one in read.velocities if read.crosses(one) and "/manager" in one.subscribers
             }
-            assert heard <= {one.topics["command"] for one in found.suggestions}
+            assert heard <= {suggestion.topics["command"] for suggestion in found.suggestions}
 
 
 def in_one_process(nodes: set[str], graph: list[TopicFacts]) -> list[TopicFacts]:
@@ -257,8 +257,8 @@ def test_a_robot_moves_behind_each_proposal_while_all_its_registered_nodes_send(
             for topic in graph_of(robot)
         ]
         found = advice(graph)
-        for one in found.suggestions:
-            assert moves(one, graph, named_values(one, found.left_out)), one.command
+        for suggestion in found.suggestions:
+            assert moves(suggestion, graph, named_values(suggestion, found.left_out)), suggestion.command
 
 
 def named_values(one: Suggestion, sentences: Sequence[str]) -> dict[str, str]:

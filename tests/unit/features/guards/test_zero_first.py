@@ -18,8 +18,8 @@ STOPPERS = {
     "publishes": f"int n = 0; {X} {{ return; }} event tick() every 20ms {{ STOP; }}",
 }
 BEFORE = sorted(
-    name for name, one in PRESETS.items()
-    if TWIST in one.topics.get("command", {}) and name not in {"rate", "speed"}
+    name for name, preset in PRESETS.items()
+    if TWIST in preset.topics.get("command", {}) and name not in {"rate", "speed"}
 )  # fmt: skip
 """Presets that stop a node in phases of `judge`: without evidence, after a silence, or at NaN."""
 
@@ -65,6 +65,6 @@ def test_a_stop_by_another_guard_is_not_a_zero_of_the_node(first: str, preset: s
 
 
 def test_every_preset_that_speaks_of_a_zero_is_among_them() -> None:
-    heads = {name: one.text.partition("\n\n")[0].replace("\n// ", " ") for name, one in PRESETS.items()}
+    heads = {name: preset.text.partition("\n\n")[0].replace("\n// ", " ") for name, preset in PRESETS.items()}
     speaks = re.compile(r"node (?:must )?commands? zero")
     assert {name for name, head in heads.items() if speaks.search(head)} == {*WAITING}

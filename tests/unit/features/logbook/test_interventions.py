@@ -111,14 +111,14 @@ def off(*entries: LogEntry) -> dict[str, LastingState]:
 
 
 def test_a_guard_that_was_off_has_its_time_its_author_and_who_ended_it() -> None:
-    found = off(
+    states = off(
         entry(1, "monitor disabled", "speed", who="ann"),
         entry(2, "monitor disabled", "fence", who="bob"),
         entry(3, "monitor enabled", "speed", who="eve"),
     )
-    assert (found["speed"].since_utc, found["speed"].until_utc) == (rfc3339(HOUR), rfc3339(3 * HOUR))
-    assert (found["speed"].by, found["speed"].ended_by) == ("ann", "eve")
-    assert found["fence"].until_utc == ""
+    assert (states["speed"].since_utc, states["speed"].until_utc) == (rfc3339(HOUR), rfc3339(3 * HOUR))
+    assert (states["speed"].by, states["speed"].ended_by) == ("ann", "eve")
+    assert states["fence"].until_utc == ""
 
 
 @pytest.mark.parametrize(
@@ -135,23 +135,23 @@ def test_a_guard_that_was_off_has_its_time_its_author_and_who_ended_it() -> None
 def test_a_guard_that_is_removed_while_it_is_off_is_off_no_longer(
     detail: dict[str, Any], until: int | None
 ) -> None:
-    found = off(
+    states = off(
         entry(1, "monitor disabled", "speed", who="ann"),
         entry(3, "specifications loaded", sha256="b", who="eve", **detail),
     )
-    assert found["speed"].until_utc == ("" if until is None else rfc3339(until * HOUR))
-    assert found["speed"].ended_by == ("" if until is None else "eve")
+    assert states["speed"].until_utc == ("" if until is None else rfc3339(until * HOUR))
+    assert states["speed"].ended_by == ("" if until is None else "eve")
 
 
 def test_a_guard_that_was_never_on_is_off_from_its_load() -> None:
     loaded: dict[str, Any] = {"sha256": "b", "monitors": ["speed"], "off": {"speed": "disabled"}}
-    found = off(
+    states = off(
         entry(1, "specifications loaded", who="ann", **loaded),
         entry(2, "monitor enabled", "speed", who="bob"),
         entry(4, "appliance started", version="1", off={"fence": "in shadow mode"}),
     )
-    assert (found["speed"].since_utc, found["speed"].until_utc) == (rfc3339(HOUR), rfc3339(2 * HOUR))
-    assert (found["fence"].state, found["fence"].until_utc) == ("in shadow mode", "")
+    assert (states["speed"].since_utc, states["speed"].until_utc) == (rfc3339(HOUR), rfc3339(2 * HOUR))
+    assert (states["fence"].state, states["fence"].until_utc) == ("in shadow mode", "")
 
 
 @pytest.mark.parametrize(
@@ -165,10 +165,10 @@ def test_a_span_is_in_a_period_that_it_meets(since: float, until: float, seen: b
 
 
 def test_each_start_begins_the_time_of_a_version() -> None:
-    found = read(
+    states = read(
         entry(1, "appliance started", version="0.3.0"), entry(5, "appliance started", version="0.4.0")
     ).software
-    assert [(span.state, span.since_utc, span.until_utc) for span in found] == [
+    assert [(span.state, span.since_utc, span.until_utc) for span in states] == [
         ("0.3.0", rfc3339(HOUR), rfc3339(5 * HOUR)),
         ("0.4.0", rfc3339(5 * HOUR), ""),
     ]
@@ -254,14 +254,14 @@ def test_two_logs_are_one_history_by_time_and_a_moved_record_counts_once() -> No
         entry(6, "took over", appliance="b", other="a"),
         entry(7, "monitor enabled", "speed", who="bob", earlier="disabled"),
     ]
-    found = read_records(merge({"a": a, "b": b}), ALWAYS)
-    assert [(row.appliance, row.event) for row in found.interventions] == [
+    reading = read_records(merge({"a": a, "b": b}), ALWAYS)
+    assert [(row.appliance, row.event) for row in reading.interventions] == [
         ("a", "policy file refused"), ("a", "monitor disabled"), ("a", "authority handed over"),
         ("b", "took over"), ("b", "monitor enabled"),
     ]  # fmt: skip
-    (switched,) = found.switched_off
+    (switched,) = reading.switched_off
     assert (switched.appliance, switched.until_utc) == ("a", rfc3339(7 * HOUR))
-    (driver,) = found.drivers
+    (driver,) = reading.drivers
     assert driver.until_utc == rfc3339(6 * HOUR)  # a takeover ends who drove
 
 
@@ -271,10 +271,10 @@ def test_a_clock_that_was_set_back_does_not_change_the_order_of_a_log() -> None:
         entry(2, "monitor enabled", "speed", earlier="disabled"),
     )
     backwards = [LogEntry(1, late.record), LogEntry(2, early.record)]
-    found = read_records(
+    reading = read_records(
         merge({"a": backwards, "b": [entry(3, "host renewed", name="t", replaced="1")]}), ALWAYS
     )
-    events = [row.event for row in found.interventions]
+    events = [row.event for row in reading.interventions]
     assert events == ["host renewed", "monitor disabled", "monitor enabled"]
 
 
@@ -332,7 +332,7 @@ def _fields(code: ast.AST) -> Iterator[str]:
 
 
 def _states(call: ast.Call, event: str) -> bool:
-    return any(isinstance(one, ast.Constant) and one.value == event for one in call.args)
+    return any(isinstance(arg, ast.Constant) and arg.value == event for arg in call.args)
 
 
 @cache
@@ -469,12 +469,12 @@ def test_a_name_of_now_is_marked_and_a_name_of_then_is_not() -> None:
 
 
 def test_two_machines_have_a_column() -> None:
-    found = read_records(
+    reading = read_records(
         merge({"a": [_HANDED[0]], "b": [entry(5, "took over", appliance="b", other="a")]}), ALWAYS
     )
     logs = [
         ReportedLog(name=name, id=name, begins_utc=rfc3339(HOUR), last=1, verification=None) for name in "ab"
     ]
-    made = report(logs=logs, interventions=found.interventions, drivers=found.drivers)
+    made = report(logs=logs, interventions=reading.interventions, drivers=reading.drivers)
     assert "<tr><th>machine<th>time (UTC)" in page(made) and "<th>machine" not in page(report())
     assert any("  b  took over" in line for line in report_lines(made))

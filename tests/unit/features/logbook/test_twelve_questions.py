@@ -220,7 +220,7 @@ ABSENT: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("name", ABSENT)
 def test_an_interface_that_is_off_is_not_named(name: str) -> None:
     named = [
-        {one.name for one in report_verb.interfaces(status, IN_FORCE, TOKENS, Reading())}
+        {interface.name for interface in report_verb.interfaces(status, IN_FORCE, TOKENS, Reading())}
         for status in (STATUS, STATUS | ABSENT[name])
     ]
     assert named[0] - named[1] == {name}

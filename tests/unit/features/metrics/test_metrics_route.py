@@ -119,6 +119,6 @@ def test_tunnels_are_measured() -> None:
 
 def test_processes_of_one_role_have_separate_series() -> None:
     answer = body([{"role": "relay", "pid": os.getpid(), "restarts": restarts} for restarts in (1, 2)])
-    lines = [one for one in render(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
+    lines = [line for line in render(answer, CALLS).decode().splitlines() if line.startswith("rosrv_process")]
     assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
     assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines

@@ -31,7 +31,7 @@ def record(fields: dict[str, bytes], data: bytes) -> bytes:
     return U32(len(header)) + header + U32(len(data)) + data
 
 
-def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> Path:
+def bag(path: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> Path:
     out = bytearray(b"#ROSBAG V2.0\n" + bytes(4096))
     infos = b""
     for compression, packed, entries in chunks:
@@ -47,17 +47,17 @@ def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> 
         b"",
     )
     out[13 : 13 + len(head)] = head
-    place.write_bytes(bytes(out) + record(*CONNECTION) + infos)
-    return place
+    path.write_bytes(bytes(out) + record(*CONNECTION) + infos)
+    return path
 
 
 def message(seconds: int, text: bytes) -> bytes:
     return record({"op": b"\x02", "conn": U32(0), "time": U64(seconds)}, U32(len(text)) + text)
 
 
-def refusal(place: Path) -> str:
+def refusal(path: Path) -> str:
     with pytest.raises(RecordingError) as ended:
-        list(RecordedFile(place, ["*"]).messages())
+        list(RecordedFile(path, ["*"]).messages())
     return str(ended.value)
 
 
@@ -69,13 +69,11 @@ def test_a_chunk_is_unpacked_up_to_a_limit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     one = message(1, b"x" * 1000)
-    place = bag(tmp_path / "x.bag", [(name, pack(one), [(1, 0)])])
+    path = bag(tmp_path / "x.bag", [(name, pack(one), [(1, 0)])])
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", len(one))
-    assert [data for _topic, _time, data in RecordedFile(place, ["*"]).messages()] == [
-        U32(1000) + b"x" * 1000
-    ]
-    place = bag(tmp_path / "x.bag", [(name, pack(message(1, bytes(2000))), [(1, 0)])])
-    assert f"more than {len(one)} bytes" in refusal(place)
+    assert [data for _topic, _time, data in RecordedFile(path, ["*"]).messages()] == [U32(1000) + b"x" * 1000]
+    path = bag(tmp_path / "x.bag", [(name, pack(message(1, bytes(2000))), [(1, 0)])])
+    assert f"more than {len(one)} bytes" in refusal(path)
 
 
 @pytest.mark.parametrize(("name", "pack"), [("bz2", bz2.compress), ("lz4", lz4.frame.compress)])
@@ -91,8 +89,8 @@ def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyP
     large = bz2.compress(message(0, b"") * 1 + bytes(1 << 17))
     turns = [("bz2", large, [(0, 0)] * 40), ("bz2", large, [(0, 0)] * 40)]
     assert RecordedFile(bag(tmp_path / "x.bag", turns), ["*"]).message_count == 80
-    one = bag(tmp_path / "one.bag", [("none", message(1, bytes(1 << 17)), [(1, 0)] * 100)])
-    assert "more than 4 times its size" in refusal(one)
+    path = bag(tmp_path / "one.bag", [("none", message(1, bytes(1 << 17)), [(1, 0)] * 100)])
+    assert "more than 4 times its size" in refusal(path)
     chain = record(*CONNECTION)
     offsets = [(1, number * len(chain)) for number in range(500)]
     links = bag(tmp_path / "links.bag", [("none", chain * 500 + message(1, b""), offsets)])
@@ -121,19 +119,19 @@ def test_chunks_of_the_same_time_are_unpacked_once(
 
 
 def test_chunks_cannot_share_an_index(tmp_path: Path) -> None:
-    place = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
-    data = place.read_bytes()
+    path = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
+    data = path.read_bytes()
     info = data[data.index(record(*CONNECTION)) + len(record(*CONNECTION)) :]
-    place.write_bytes(data.replace(b"chunk_count=" + U32(1), b"chunk_count=" + U32(100)) + info * 99)
-    assert "share an index" in refusal(place)
+    path.write_bytes(data.replace(b"chunk_count=" + U32(1), b"chunk_count=" + U32(100)) + info * 99)
+    assert "share an index" in refusal(path)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("times", [[1000.0], [1000.0, 1000.0], [1000.0, 1000.000000001], [1000.0, 1001.0]])
 @pytest.mark.parametrize("share", ["0", "0.3", "0.9"])
 def test_a_short_recording_is_learned_from(times: list[float], share: str, tmp_path: Path) -> None:
-    place = make_bag(tmp_path / "x.bag", [("/t", "std_msgs/Int32", time, number(1)) for time in times])
-    other = shutil.copy(place, tmp_path / "other.bag")
+    path = make_bag(tmp_path / "x.bag", [("/t", "std_msgs/Int32", time, number(1)) for time in times])
+    other = shutil.copy(path, tmp_path / "other.bag")
     for arguments in (["--hold-out", share], ["--bag", str(other)]):
-        result = rosrv("monitor", "learn", "--bag", str(place), *arguments)
+        result = rosrv("monitor", "learn", "--bag", str(path), *arguments)
         assert result.returncode in (0, 2), result.stderr

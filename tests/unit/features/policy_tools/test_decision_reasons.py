@@ -30,12 +30,12 @@ def explained(host: str, category: Category, resource: str, node: str = "/ocu") 
 
 
 def test_rules_that_lost_are_named_most_specific_first() -> None:
-    found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd")
-    assert found.decision.rule is not None
-    assert found.decision.rule.key == "/arm/cmd"
-    lost = [(one.rule.key, one.grants) for one in found.lost]
+    explanation = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd")
+    assert explanation.decision.rule is not None
+    assert explanation.decision.rule.key == "/arm/cmd"
+    lost = [(one.rule.key, one.grants) for one in explanation.lost]
     assert lost == [("/arm/*", True), ("/arm/**", True), ("default", False)]
-    assert found.lost[0].why == "/arm/cmd is more specific"
+    assert explanation.lost[0].why == "/arm/cmd is more specific"
 
 
 def test_the_word_that_matches_the_host_is_shown() -> None:
@@ -44,19 +44,19 @@ def test_the_word_that_matches_the_host_is_shown() -> None:
 
 
 def test_node_rule_is_part_of_the_answer() -> None:
-    found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd", node="/radar")
-    assert found.decision.allowed
-    assert not found.allowed
-    assert decide(POLICY, rights_of(found.request)).allowed == found.allowed
-    assert any(line.startswith("together: denied") for line in render(found))
+    explanation = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd", node="/radar")
+    assert explanation.decision.allowed
+    assert not explanation.allowed
+    assert decide(POLICY, rights_of(explanation.request)).allowed == explanation.allowed
+    assert any(line.startswith("together: denied") for line in render(explanation))
 
 
 def test_command_is_explained_under_its_wire_name_too() -> None:
-    found = explained("10.0.0.1", Category.COMMAND, "system.listMethods")
-    assert found.decision.allowed
-    assert found.decision.rule is not None
-    assert found.decision.rule.key == "listMethods"
-    assert [lost.rule.key for lost in found.lost] == ["default"]
+    explanation = explained("10.0.0.1", Category.COMMAND, "system.listMethods")
+    assert explanation.decision.allowed
+    assert explanation.decision.rule is not None
+    assert explanation.decision.rule.key == "listMethods"
+    assert [lost.rule.key for lost in explanation.lost] == ["default"]
 
 
 def test_text_says_decision_and_place() -> None:

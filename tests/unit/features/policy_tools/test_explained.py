@@ -61,11 +61,11 @@ def events_of(
         for one in given:
             monitored.time = START + one.at * MS
             if one.where == "request":
-                place = ObservationPoint("k", "/mode", "10.0.0.8", one.who)
-                monitored.interceptor.judge(place, "request", bytes([one.value]))
+                point = ObservationPoint("k", "/mode", "10.0.0.8", one.who)
+                monitored.interceptor.judge(point, "request", bytes([one.value]))
             elif one.where == "response":
-                place = ObservationPoint("k", "/mode", "10.0.0.9", one.who)
-                monitored.interceptor.judge(place, "response", struct.pack("<BI", one.value, 0))
+                point = ObservationPoint("k", "/mode", "10.0.0.9", one.who)
+                monitored.interceptor.judge(point, "response", struct.pack("<BI", one.value, 0))
             else:
                 body = message("std_msgs/Int32", data=one.value)
                 monitored.through(
@@ -82,8 +82,8 @@ def events_of(
 def told(row: Row, given: Iterable[Given], *, together: bool, shadow: bool = False) -> MonitorEvent | None:
     names = [row.text.removeprefix("hold ").split("(")[0].strip()] if shadow else []
     kind = f"shadow {row.kind}" if shadow else row.kind
-    found = events_of(row, given, together=together, shadows=names)
-    return next((one for one in found if one.kind == kind and not one.count), None)
+    events = events_of(row, given, together=together, shadows=names)
+    return next((event for event in events if event.kind == kind and not event.count), None)
 
 
 def place(text: str, piece: str) -> str:
@@ -92,11 +92,11 @@ def place(text: str, piece: str) -> str:
 
 
 def check(row: Row, *, together: bool, shadow: bool = False) -> None:
-    found = told(row, row.given, together=together, shadow=shadow)
-    assert found is not None
-    detail = found.detail
-    assert found.caller_id == row.by
-    assert bool(found.host) is bool(row.by)
+    event = told(row, row.given, together=together, shadow=shadow)
+    assert event is not None
+    detail = event.detail
+    assert event.caller_id == row.by
+    assert bool(event.host) is bool(row.by)
     at = place(row.text, row.at)
     assert at in detail["at"]
     where = {place(row.text, piece): values for piece, values in row.where.items()}
@@ -104,7 +104,7 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
     assert detail.get("values", {}) == row.values
     named = detail.get("why", {}).get("events", [])
     assert [(one["event"], one.get("node", "")) for one in named] == [*row.because]
-    check_lines(row, found, at, where)
+    check_lines(row, event, at, where)
     if named:
         times = {one["time"] for one in named}
         alone = [one for one in row.given if moment(START + one.at * MS) in times]
@@ -112,7 +112,7 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
             row, [*alone, Given(row.given[-1].at, "/clock", 0, "/clock")], together=together, shadow=shadow
         )
         assert again is not None
-        assert again.text == found.text
+        assert again.text == event.text
 
 
 def check_lines(row: Row, found: MonitorEvent, at: str, where: Mapping[str, Mapping[str, object]]) -> None:

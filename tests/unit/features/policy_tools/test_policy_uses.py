@@ -30,10 +30,10 @@ def log(tmp_path: Path) -> Path:
 
 def states(log: Path, most: int = 10) -> tuple[bool, dict[str, str]]:
     current = example(PolicyKnown, revision=7, text=TEXT, file="p.ini")
-    found = policy_uses(
+    uses = policy_uses(
         log, current, [Registration("10.0.0.7", "/laser", "registerPublisher", "/scan")], 0, most
     )
-    return found.whole, {row.rule.key: row.state for row in found.rules}
+    return uses.whole, {row.rule.key: row.state for row in uses.rules}
 
 
 def test_each_rule_has_its_use_by_recorded_requests_and_by_registrations_of_now(log: Path) -> None:

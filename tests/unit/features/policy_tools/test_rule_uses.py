@@ -41,24 +41,24 @@ def used(*observations: tuple[str, Category, str, str, str]) -> RuleUses:
 
 
 def test_a_request_uses_each_rule_that_it_needed() -> None:
-    found = rows(used(("10.0.0.5", Category.COMMAND, "getParam", "getParam", "/arm/gain")))
-    assert {name for name, row in found.items() if row.used} == {
+    uses = rows(used(("10.0.0.5", Category.COMMAND, "getParam", "getParam", "/arm/gain")))
+    assert {name for name, row in uses.items() if row.used} == {
         "Commands getParam",
         "Parameters read /arm/**",
     }
-    assert found["Commands getParam"].state == "used"
+    assert uses["Commands getParam"].state == "used"
 
 
 def test_each_host_of_a_line_has_uses_of_its_own() -> None:
-    found = rows(used(("10.0.0.5", Category.PUBLISH, "/cmd_vel", "registerPublisher", "")))
-    assert (found["Publishers /cmd_vel"].state, found["Publishers /cmd_vel"].unused) == ("unused", ("robot",))
-    assert found["Nodes default"].state == "used"
+    uses = rows(used(("10.0.0.5", Category.PUBLISH, "/cmd_vel", "registerPublisher", "")))
+    assert (uses["Publishers /cmd_vel"].state, uses["Publishers /cmd_vel"].unused) == ("unused", ("robot",))
+    assert uses["Nodes default"].state == "used"
 
 
 def test_a_denied_request_uses_no_rule_and_a_line_without_hosts_grants_nothing() -> None:
-    found = rows(used(("10.0.0.5", Category.PUBLISH, "/scan", "registerPublisher", "")))
-    assert found["Publishers /scan"].state == "unused"
-    assert "Commands shutdown" not in found
+    uses = rows(used(("10.0.0.5", Category.PUBLISH, "/scan", "registerPublisher", "")))
+    assert uses["Publishers /scan"].state == "unused"
+    assert "Commands shutdown" not in uses
 
 
 def test_a_registration_that_lives_is_a_use_however_old() -> None:
@@ -74,11 +74,11 @@ def test_nothing_is_unused_where_records_are_removed(name: str) -> None:
 
 
 def test_a_host_whose_requests_are_only_counted_is_unknown_and_others_are_not() -> None:
-    found = rows(used(), "10.0.0.5")
-    row = found["Publishers /cmd_vel"]
+    uses = rows(used(), "10.0.0.5")
+    row = uses["Publishers /cmd_vel"]
     assert (row.unknown, row.unused) == (("joystick",), ("robot",))
-    assert found["Publishers /scan"].state == "unused"
-    assert found["Subscribers /scan"].state == "unknown"
+    assert uses["Publishers /scan"].state == "unused"
+    assert uses["Subscribers /scan"].state == "unknown"
 
 
 def test_a_right_that_has_ended_is_named_used_or_not() -> None:

@@ -79,7 +79,7 @@ def test_every_host_has_the_answer_of_its_network(text: str, action: tuple[Categ
     policy = compile_policy(text, file="p.ini", hosts={"a": ipaddress.ip_address("10.0.0.5")}, robot=robot)
     answers = {answer.network: answer for answer in who_may(policy, *action, node)}
     for host in _edges(policy.hosts.networks()):
-        rights = [one for one in rights_of(Request(host, node, *action)) if one.request.resource]
+        rights = [right for right in rights_of(Request(host, node, *action)) if right.request.resource]
         assert (
             answers[policy.named_as(host) if policy.names(host) else None].decision.word
             == decide(policy, rights).word

@@ -87,7 +87,7 @@ def test_a_judged_message_has_the_time_of_its_judgement(memory: int) -> None:
         stream.write(batch(b"3").view, 1, 3, 5000 * second)
     reader = RingReader(memoryview(mmap.mmap(memory, 0, prot=mmap.PROT_READ)))
     [found] = reader.read(*EVER)
-    assert [one.time for one in found.batches] == [4999 * second, 5000 * second + 7, 5060 * second - 7]
+    assert [frames.time for frames in found.batches] == [4999 * second, 5000 * second + 7, 5060 * second - 7]
 
 
 @pytest.mark.parametrize("size", [10, 100_000])

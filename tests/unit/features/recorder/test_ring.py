@@ -51,10 +51,10 @@ def opened(writer: RingWriter, topic: str = "/a", host: str = "10.0.0.1", **head
     return stream
 
 
-def texts(found: list[StreamFrames], topic: str = "/a") -> list[bytes]:
+def texts(frames: list[StreamFrames], topic: str = "/a") -> list[bytes]:
     return [
         bytes(body)
-        for one in found
+        for one in frames
         if one.header["topic"] == topic
         for batch in one.batches
         for body in batch.frames

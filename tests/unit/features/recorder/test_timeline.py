@@ -106,8 +106,8 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
 
 
 def test_the_chosen_message_of_a_time_is_the_last_until_then(bag: Path) -> None:
-    found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND + SECOND // 50, neighbours=2)
-    chosen = found.messages[found.chosen]
+    recorded_messages = messages_around(RECORDING, bag, BEGAN + 2 * SECOND + SECOND // 50, neighbours=2)
+    chosen = recorded_messages.messages[recorded_messages.chosen]
     assert (chosen.time - BEGAN, chosen.fields["data"]) == (2 * SECOND, "1.0")
 
 
@@ -134,8 +134,8 @@ def test_the_chosen_message_of_a_record_is_the_one_that_it_is_about(tmp_path: Pa
     writer.close()
 
     def chosen(at: str, *topics: str) -> tuple[str, str]:
-        found = messages_around(RECORDING, path, at, topics)
-        message = found.messages[found.chosen]
+        recorded_messages = messages_around(RECORDING, path, at, topics)
+        message = recorded_messages.messages[recorded_messages.chosen]
         return message.sender.node, message.fields["data"]
 
     assert chosen(f"{1:020x}") == chosen(f"{1:020x}", "/chatter") == ("/talker", "7.5")
@@ -168,8 +168,8 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["2026-02-30", "10000-01-01", "2026-03-01", "", "1795155949800000000-4109"])
 def test_an_impossible_date_is_refused(text: str) -> None:
     assert MessagePosition.parse(text) is None
-    place = MessagePosition(1795155949800000000, 4109, 2210)
-    assert MessagePosition.parse(str(place)) == place
+    position = MessagePosition(1795155949800000000, 4109, 2210)
+    assert MessagePosition.parse(str(position)) == position
 
 
 def test_publishers_cannot_forge_events(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def checks() -> set[str]:
 
 def test_each_reason_not_to_start_has_its_check() -> None:
     assert raised() == set(TWINS), "add the check to `rosrv selftest`, or the reason why it has none"
-    named = {name for one in TWINS.values() if isinstance(one, set) for name in one}
+    named = {name for twin in TWINS.values() if isinstance(twin, set) for name in twin}
     assert named - checks() == set()
 
 
@@ -104,7 +104,7 @@ def test_a_program_without_which_nothing_starts_is_a_failure(
 
 def test_a_restore_that_did_not_finish_fails(tmp_path: Path) -> None:
     set_mark(tmp_path)
-    assert [one.outcome for one in file_checks.unfinished_restore(tmp_path)] == ["fail"]
+    assert [finding.outcome for finding in file_checks.unfinished_restore(tmp_path)] == ["fail"]
 
 
 def test_a_membership_that_cannot_be_read_fails(tmp_path: Path) -> None:
@@ -146,4 +146,4 @@ def test_the_appliance_starts_after_the_advice_about_a_certificate(
         done = CliRunner().invoke(app, ["host", "authority", "rotate", "--state", str(tmp_path), "--yes"])
         assert (done.exit_code, "host authority rotate" in found.advice) == (0, True), done.output
     start()
-    assert {one.outcome for one in file_checks.certificates(tmp_path)} == {"ok"}
+    assert {certificate.outcome for certificate in file_checks.certificates(tmp_path)} == {"ok"}

@@ -90,9 +90,9 @@ def test_a_crashing_check_is_a_finding() -> None:
         yield ok("one", "fine")
         raise RuntimeError("odd")
 
-    found = list(run_check("one", broken))
-    assert found[0] == ok("one", "fine")
-    assert found[1] == fail(
+    findings = list(run_check("one", broken))
+    assert findings[0] == ok("one", "fine")
+    assert findings[1] == fail(
         "one", "the check failed: RuntimeError: odd", "please report this defect in rosrv"
     )
 

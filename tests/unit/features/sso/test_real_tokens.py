@@ -186,8 +186,8 @@ TEXTS = [
 
 def test_two_names_or_subjects_are_never_one() -> None:
     for escape in (name_of, subject_of):
-        for one, other in itertools.combinations(TEXTS, 2):
-            assert escape(one) != escape(other), (one, other)
+        for text, other in itertools.combinations(TEXTS, 2):
+            assert escape(text) != escape(other), (text, other)
     assert name_of("jo\u0308rg") == name_of("j\u00f6rg"), "one spelling of a name"
     assert subject_of("jo\u0308rg") != subject_of("j\u00f6rg"), "a subject is compared byte by byte"
     assert subject_of("auth0|CORP\\ann o'neil/=") == "auth0|CORP\\ann%20o'neil/="

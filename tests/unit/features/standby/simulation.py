@@ -377,8 +377,8 @@ class SimulatedRobot(Host):
     def admitted(self) -> set[str]:
         shut = {
             name
-            for name, one in PAIR_SETTINGS.appliances.items()
-            if f"ip saddr {one.address} drop" in self.rules
+            for name, appliance in PAIR_SETTINGS.appliances.items()
+            if f"ip saddr {appliance.address} drop" in self.rules
         }
         return set(BOTH) - shut
 
@@ -517,7 +517,7 @@ class History:
         cut = self.random.choice([(), (), (), ("a", "b"), ("a", "witness"), ("b", "witness")])
         self._heal(cut)
         self._turn_until(self.now + HEALED)
-        active = {name for name, one in self.appliances.items() if one.active}
+        active = {name for name, appliance in self.appliances.items() if appliance.active}
         reaching = set(BOTH) - (set(cut) if "witness" in cut else set())
         self.require(
             (len(active) == 1 and self.robot.admitted() == active <= reaching)

@@ -45,10 +45,10 @@ class Lease:
         return [one for one in self.tick(**state) if isinstance(one, WitnessRequest)]
 
     def operations(self, **state: Any) -> list[str]:
-        return [one.operation for one in self.requests(**state)]
+        return [request.operation for request in self.requests(**state)]
 
     def request(self, operation: str) -> WitnessRequest:
-        (found,) = [one for one in self.requests() if one.operation == operation]
+        (found,) = [request for request in self.requests() if request.operation == operation]
         return found
 
     def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:

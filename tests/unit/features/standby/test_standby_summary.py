@@ -90,9 +90,9 @@ TROUBLES: list[tuple[tuple[dict[str, Any], ...], dict[str, Any], str]] = [
     ("of", "more", "text"), [(of, more, text) for sides, more, text in TROUBLES for of in sides]
 )
 def test_each_trouble_is_reported_everywhere(of: dict[str, Any], more: dict[str, Any], text: str) -> None:
-    found = takeover_obstacles(state(of, more), "as the process `lease` found sooner")
-    assert found == [text]
-    reported = state(of, more | {"troubles": found})
+    obstacles = takeover_obstacles(state(of, more), "as the process `lease` found sooner")
+    assert obstacles == [text]
+    reported = state(of, more | {"troubles": obstacles})
     assert standby_view(reported).exit_status == 1
     assert [*samples_of(reported)["rosrv_standby_can_take_over"]] == [((), False)]
     assert [*samples_of(state(of, {}))["rosrv_standby_can_take_over"]] == [((), True)]

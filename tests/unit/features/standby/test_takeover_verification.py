@@ -300,7 +300,7 @@ def test_a_forged_takeover(pair: Pair, change: str, finding: tuple[Kind, int], m
 )
 def test_a_takeover_with_an_epoch_of_another_one(pair: Pair, epoch: str, message: str) -> None:
     pair.forge_b(setting("epoch", epoch, 5))
-    assert any(re.search(message, one.message) for one in verified(pair.a, pair.b).findings)
+    assert any(re.search(message, finding.message) for finding in verified(pair.a, pair.b).findings)
 
 
 def test_a_removed_decision(pair: Pair) -> None:

@@ -65,9 +65,9 @@ def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> LogForwarder:
     return LogForwarder(path, path.with_name("position.json"), kept, formatter, chosen=chosen)
 
 
-def run(one: LogForwarder, steps: int = 100) -> None:
+def run(log_forwarder: LogForwarder, steps: int = 100) -> None:
     for _ in range(steps):
-        if one.step() > 0:
+        if log_forwarder.step() > 0:
             return
     raise AssertionError("it does not come to an end")
 
@@ -91,39 +91,39 @@ def everything(path: Path) -> list[int]:
 def test_the_whole_log_is_sent_in_order(make_log: MakeLog, path: Path, kept: Kept) -> None:
     log = make_log()
     record(log, 700)
-    one = forwarder(path, kept)
-    run(one)
+    log_forwarder = forwarder(path, kept)
+    run(log_forwarder)
     record(log, 3)
-    run(one)
+    run(log_forwarder)
     assert kept.sequences() == everything(path)
-    assert one.progress.behind == 0
-    assert one.progress.trouble == ""
+    assert log_forwarder.progress.behind == 0
+    assert log_forwarder.progress.trouble == ""
 
 
 def test_a_failed_batch_is_sent_again(make_log: MakeLog, path: Path, kept: Kept) -> None:
     log = make_log()
     record(log, 10)
     kept.failing = 4
-    one = forwarder(path, kept)
+    log_forwarder = forwarder(path, kept)
     pauses = []
     for _ in range(4):
-        pauses.append(one.step())
+        pauses.append(log_forwarder.step())
         let_pass(log, pauses[-1])
     assert pauses == sorted(pauses)
     assert pauses[-1] > pauses[0]
-    assert one.progress.trouble == "nobody there"
-    assert one.progress.behind >= 10
-    assert one.progress.seconds > 0
-    run(one)
+    assert log_forwarder.progress.trouble == "nobody there"
+    assert log_forwarder.progress.behind >= 10
+    assert log_forwarder.progress.seconds > 0
+    run(log_forwarder)
     assert kept.sequences() == everything(path)
-    assert one.progress.trouble == ""
+    assert log_forwarder.progress.trouble == ""
 
 
 def test_the_interval_is_bounded(make_log: MakeLog, path: Path, kept: Kept) -> None:
     record(make_log(), 1)
     kept.failing = 50
-    one = forwarder(path, kept)
-    assert max(one.step() for _ in range(50)) == 30.0
+    log_forwarder = forwarder(path, kept)
+    assert max(log_forwarder.step() for _ in range(50)) == 30.0
 
 
 def test_it_continues_after_a_restart(make_log: MakeLog, path: Path, kept: Kept) -> None:
@@ -159,13 +159,13 @@ def test_only_denials_are_sent_if_configured(make_log: MakeLog, path: Path, kept
     log.record(decision(log, decision=None, event="probe failed", severity=Severity.ALARM))
     assert settle(log) is None
     log.close()
-    one = forwarder(path, kept, "denials")
-    run(one)
+    log_forwarder = forwarder(path, kept, "denials")
+    run(log_forwarder)
     records = [message for message in kept.messages if SYSLOG_ELEMENT not in message.elements]
     assert {one.event for one in records} == {"decision", "probe-failed"}
     assert [one.fields.get("decision") for one in records if one.event == "decision"] == ["deny"]
     assert len(kept.messages) - len(records) == len(signed_checkpoints(path))
-    assert one.progress.behind == 0
+    assert log_forwarder.progress.behind == 0
 
 
 def test_checkpoints_at_the_receiver_prove_the_log(
@@ -211,11 +211,11 @@ def test_records_removed_before_sending_are_counted(
         if everything(path)[0] > before + 1:
             break
     log.close()
-    one = forwarder(path, kept)
-    run(one)
-    assert one.progress.missed == everything(path)[0] - before - 1
-    assert one.progress.missed > 0
-    assert one.progress.behind == 0
+    log_forwarder = forwarder(path, kept)
+    run(log_forwarder)
+    assert log_forwarder.progress.missed == everything(path)[0] - before - 1
+    assert log_forwarder.progress.missed > 0
+    assert log_forwarder.progress.behind == 0
 
 
 def test_an_old_log_has_no_missed_records(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
@@ -229,39 +229,39 @@ def test_an_old_log_has_no_missed_records(make_log: MakeLog, path: Path, kept: K
         record(log, 1)
         if everything(path)[0] > 50:
             break
-    one = forwarder(path, kept)
-    run(one)
+    log_forwarder = forwarder(path, kept)
+    run(log_forwarder)
     assert everything(path)[0] > 50
-    assert one.progress.missed == 0
+    assert log_forwarder.progress.missed == 0
 
 
 def test_another_log_is_sent_from_its_start(make_log: MakeLog, path: Path, kept: Kept) -> None:
     log = make_log()
     record(log, 20)
-    one = forwarder(path, kept)
-    run(one)
+    log_forwarder = forwarder(path, kept)
+    run(log_forwarder)
     log.close()
     for file in path.parent.glob("audit.db*"):
         file.unlink()
     kept.lines.clear()
     record(make_log(), 4)
-    one.step()  # notices the new log
-    run(one)
+    log_forwarder.step()  # notices the new log
+    run(log_forwarder)
     assert kept.sequences() == everything(path)
 
 
 def test_a_missing_log_is_waited_for(path: Path, kept: Kept) -> None:
-    one = forwarder(path, kept)
-    assert one.step() > 0
-    assert "no audit log yet" in one.progress.trouble
+    log_forwarder = forwarder(path, kept)
+    assert log_forwarder.step() > 0
+    assert "no audit log yet" in log_forwarder.progress.trouble
 
 
 def test_an_unreadable_position_stops_it(make_log: MakeLog, path: Path, kept: Kept) -> None:
     record(make_log(), 3)
     path.with_name("position.json").write_text("rubbish")
-    one = forwarder(path, kept)
-    assert one.step() > 0
-    assert "position.json" in one.progress.trouble
+    log_forwarder = forwarder(path, kept)
+    assert log_forwarder.step() > 0
+    assert "position.json" in log_forwarder.progress.trouble
     assert kept.lines == []
 
 
@@ -291,14 +291,14 @@ def test_a_restored_log_is_continued(
     log = make_log(checkpoint_every=5)
     let_pass(log, 1)  # so that the new records differ from those that were lost
     record(log, later)
-    one = forwarder(path, kept)
-    run(one)
+    log_forwarder = forwarder(path, kept)
+    run(log_forwarder)
     record(log, 10)
     log.close()
-    run(one)
+    run(log_forwarder)
     assert [number for number in everything(path) if number > before] == kept.sequences()
-    assert one.progress.trouble == ""
-    assert one.progress.missed == 0
+    assert log_forwarder.progress.trouble == ""
+    assert log_forwarder.progress.missed == 0
     sealed = [int(one.fields["number"]) for one in kept.messages if SYSLOG_ELEMENT in one.elements]
     assert sealed
     assert sealed[-1] == signed_checkpoints(path)[-1].number
@@ -311,10 +311,10 @@ def test_an_old_position_beyond_the_end_is_corrected(make_log: MakeLog, path: Pa
     log_id = verify(path).log
     position = {"log": log_id, "sequence": last + 50, "checkpoint": 7}
     path.with_name("position.json").write_text(json.dumps(position))
-    one = forwarder(path, kept)
-    run(one)
+    log_forwarder = forwarder(path, kept)
+    run(log_forwarder)
     record(log, 2)
-    run(one)
+    run(log_forwarder)
     assert kept.sequences() == [last + 1, last + 2]
 
 
@@ -323,8 +323,8 @@ def test_records_removed_while_reading_are_counted(
 ) -> None:
     log = make_log()
     record(log, 30)
-    one = forwarder(path, kept)
-    one.step()
+    log_forwarder = forwarder(path, kept)
+    log_forwarder.step()
     before = kept.sequences()[-1]
     record(log, 30)
 
@@ -333,9 +333,9 @@ def test_records_removed_while_reading_are_counted(
         return SearchPage(page.entries[5:], page.cursor)
 
     monkeypatch.setattr("appliance.features.syslog.process.search", removing)
-    one.step()
+    log_forwarder.step()
     assert kept.sequences()[-1] > before
-    assert one.progress.missed == 5
+    assert log_forwarder.progress.missed == 5
 
 
 def test_a_position_is_stored_and_loaded(tmp_path: Path) -> None:
@@ -358,7 +358,7 @@ def test_an_unreadable_position_is_an_error(tmp_path: Path, text: str) -> None:
 def test_a_full_disk_delays_no_record(make_log: MakeLog, kept: Kept, monkeypatch: pytest.MonkeyPatch) -> None:
     log = make_log()
     record(log, 600)
-    one = forwarder(log.path, kept)
+    log_forwarder = forwarder(log.path, kept)
     save = "appliance.features.syslog.process.save_position"
 
     def no_space(*_arguments: object) -> None:
@@ -366,13 +366,13 @@ def test_a_full_disk_delays_no_record(make_log: MakeLog, kept: Kept, monkeypatch
 
     with monkeypatch.context() as full:
         full.setattr(save, no_space)
-        run(one)
+        run(log_forwarder)
         assert kept.sequences() == everything(log.path)
-        assert "position is not kept" in one.progress.trouble
-        assert "position.json" in one.progress.trouble
+        assert "position is not kept" in log_forwarder.progress.trouble
+        assert "position.json" in log_forwarder.progress.trouble
     record(log, 1)
-    run(one)
-    assert one.progress.trouble == ""
+    run(log_forwarder)
+    assert log_forwarder.progress.trouble == ""
     position = load_position(log.path.with_name("position.json"))
     assert position is not None
     assert position.sequence == everything(log.path)[-1]

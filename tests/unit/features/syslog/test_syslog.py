@@ -126,8 +126,8 @@ def test_any_host_name_is_valid(name: str) -> None:
 
 
 def test_a_checkpoint_has_its_signature() -> None:
-    one = SignedCheckpoint("a" * 32, 3, 120, "b" * 64, _TIME, "c" * 64, "d" * 128, "e" * 64)
-    message = parse(formatter().checkpoint(one))
+    checkpoint = SignedCheckpoint("a" * 32, 3, 120, "b" * 64, _TIME, "c" * 64, "d" * 128, "e" * 64)
+    message = parse(formatter().checkpoint(checkpoint))
     assert message.event == "checkpoint-signed"
     assert message.elements == {
         SYSLOG_ELEMENT: {

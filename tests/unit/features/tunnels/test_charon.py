@@ -109,7 +109,7 @@ def test_unwanted_tunnels_are_closed_at_each_check(charon: tuple[StandIn, ViciCl
     vici.provision(stated(1))
     stand_in.standing = [Standing(connection_name("gone"), 1, 1), Standing("(unnamed)", 2, 2)]
     for _ in range(2):
-        assert [one.name for one in vici.list_tunnels()] == ["gone"]
+        assert [tunnel.name for tunnel in vici.list_tunnels()] == ["gone"]
         assert stand_in.ended("ike") == [connection_name("gone")]
 
 

@@ -274,7 +274,7 @@ def test_no_host_keeps_an_address_outside_the_pool(tmp_path: Path) -> None:
             await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
         kit = await bench.renew("a")
         assert (kit.address, kit.appliance) == ("10.113.12.2", "10.113.12.1")
-        assert {name: str(one) for name, one in bench.tunnels.addresses.items()} == {"a": kit.address}
+        assert {name: str(address) for name, address in bench.tunnels.addresses.items()} == {"a": kit.address}
         assert bench.hosts.status().troubles == []
         assert (await bench.enrol(tokens[0], "late")).address == "10.113.12.3"
         assert (await bench.add("gone")).address == "10.113.12.4"

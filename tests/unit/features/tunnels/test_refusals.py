@@ -75,7 +75,7 @@ def test_a_refusal_at_the_first_packet_may_have_a_forged_address() -> None:
 11[NET] received packet: from 10.88.0.66[500] to 10.88.0.2[500] (268 bytes)
 11[ENC] generating IKE_SA_INIT response 0 [ N(NO_PROP) ]
 """
-    assert [one.answered for one in refusals(first + REVOKED)] == [False, True]
+    assert [refusal.answered for refusal in refusals(first + REVOKED)] == [False, True]
 
 
 @pytest.mark.parametrize("forged", [False, True], ids=["one host", "forged addresses"])

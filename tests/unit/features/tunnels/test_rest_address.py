@@ -27,9 +27,9 @@ NET = ["192.168.1.0/24"]
     ],
 )
 def test_an_unreachable_rest_says_which_setting_helps(settings: dict[str, Any], trouble: str) -> None:
-    place = rest_address(read(settings))
-    assert place.port is None
-    assert trouble in place.trouble
+    address = rest_address(read(settings))
+    assert address.port is None
+    assert trouble in address.trouble
 
 
 @pytest.mark.parametrize(
@@ -41,8 +41,8 @@ def test_an_unreachable_rest_says_which_setting_helps(settings: dict[str, Any], 
     ],
 )
 def test_the_address_where_hosts_reach_rest(settings: dict[str, Any], port: int, inner: int | None) -> None:
-    place = rest_address(read(settings))
-    assert (place.port, place.trouble, place.inner_port) == (port, "", inner)
+    address = rest_address(read(settings))
+    assert (address.port, address.trouble, address.inner_port) == (port, "", inner)
 
 
 def test_in_a_namespace_hosts_renew_without_any_setting() -> None:
@@ -62,8 +62,8 @@ def test_no_script_is_written_that_cannot_reach_rest() -> None:
     ]
     assert published == ["127.0.0.1:8443:8443"]
     listens = {"ROSRV_API": "0.0.0.0:8443", "ROSRV_ISOLATION": "container"}  # as in the Dockerfile
-    place = rest_address(resolve(None, listens | environment(), {}))
-    assert place.port is None
-    assert "ROSRV_API_PUBLISHED" in place.trouble
+    address = rest_address(resolve(None, listens | environment(), {}))
+    assert address.port is None
+    assert "ROSRV_API_PUBLISHED" in address.trouble
     override = {"ROSRV_API_PUBLISHED": "true", "ROSRV_API_NETWORKS": "[172.29.76.1/32, 192.168.1.0/24]"}
     assert rest_address(resolve(None, listens | environment() | override, {})).port == 8443

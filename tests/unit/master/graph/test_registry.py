@@ -75,7 +75,7 @@ def check(registry: Registry, known: list[Incarnation]) -> None:
     for kind in Kind:
         for resource in ("/x", "/y"):
             expected = {one.key for one in holding if (kind, resource) in one.registrations}
-            assert {one.key for one in registry.registrants(kind, resource)} == expected
+            assert {registrant.key for registrant in registry.registrants(kind, resource)} == expected
     for host in HOSTS:
         mine = [one for one in there if one.host == host]
         assert registry.nodes_of(host) == len(mine)

@@ -110,16 +110,16 @@ def test_a_camera_over_a_slow_link_stays_in_the_present(size: int, rate: int) ->
     """A frame waits a second, and for the last MiB, however long the link is too slow for 30 frames a second."""
     now, sent, room, longest = 0.0, 0, 0.0, 0.0
     queue = SendQueue(RelayLimits(), share(1 << 30), lambda: now)
-    one = Batch(memoryview(frame(size)), 1, None)
+    batch = Batch(memoryview(frame(size)), 1, None)
     for number in range(30 * 30):
         now = number / 30
-        queue.append(one)
+        queue.append(batch)
         queue.trim()
         room = min(room, size) + rate / 30
         while queue.messages and room >= size:
             room -= size
             longest = max(longest, now - (number + 1 - queue.messages) / 30)
-            queue.advance(len(one.view))
+            queue.advance(len(batch.view))
             sent += 1
     assert sent >= min(30 * 30, 25 * rate // size)
     assert longest <= 1.1 + max(1 << 20, 2 * size) / rate

@@ -78,8 +78,8 @@ class Monitored(World):
                             return event
             return None
 
-        found: MonitorEvent = self.until(find)
-        return found
+        monitor_event: MonitorEvent = self.until(find)
+        return monitor_event
 
     def typed(self) -> tuple[Peer, Peer]:
         publisher = self.upstream(TYPED)

@@ -92,8 +92,8 @@ class Monitored:
         assert batch is not None
         assert batch.messages == traffic.messages
         batch.first = first
-        place = ObservationPoint("key", traffic.topic, "10.0.0.7", publisher)
-        lane = self._lanes.setdefault((traffic.topic, publisher), TopicPipeline(self.interceptor, place))
+        point = ObservationPoint("key", traffic.topic, "10.0.0.7", publisher)
+        lane = self._lanes.setdefault((traffic.topic, publisher), TopicPipeline(self.interceptor, point))
         left = lane.through(batch)
         if left is None:
             return 0, b"", b""

@@ -35,9 +35,9 @@ class Told:
     def events(self, kind: str) -> list[MonitorEvent]:
         self.monitored.interceptor.tick()
         self.monitored.interceptor.observations.flush()
-        found: list[Any] = [one for one in self.monitored.sent() if getattr(one, "kind", "") == kind]
+        events: list[Any] = [one for one in self.monitored.sent() if getattr(one, "kind", "") == kind]
         self.monitored.heard.sent.clear()
-        return found
+        return events
 
     def counts(self) -> dict[str, tuple[int, int]]:
         return {row.name: (row.drops, row.changes) for row in self.monitored.rows()}

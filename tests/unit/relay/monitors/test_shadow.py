@@ -47,8 +47,8 @@ class Trying(Monitored):
             rows = [row for one in self.told if isinstance(one, MonitorsCounted) for row in one.rows]
             return next((row for row in reversed(rows) if row.name == name), None)
 
-        found: MonitorRow = self.until(last)
-        return found
+        monitor_row: MonitorRow = self.until(last)
+        return monitor_row
 
     def kinds(self) -> set[str]:
         return {event.kind for one in self.told if isinstance(one, MonitorsReported) for event in one.events}

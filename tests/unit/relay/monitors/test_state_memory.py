@@ -77,8 +77,8 @@ def test_a_kill_leaves_what_was_before_or_after(act: str, rounds: int) -> None:
 
 
 def test_the_first_kill_leaves_nothing_or_all() -> None:
-    found = killed_anywhere(bytearray(SIZE), lambda one: StateMemory(one).lay_out(b"head", [(b"one", 0)]))
-    assert set(map(repr, found)) == {"None", repr(StoredState(b"head", [(b"one", None)]))}
+    states = killed_anywhere(bytearray(SIZE), lambda one: StateMemory(one).lay_out(b"head", [(b"one", 0)]))
+    assert set(map(repr, states)) == {"None", repr(StoredState(b"head", [(b"one", None)]))}
 
 
 def test_a_state_without_room_changes_nothing() -> None:

@@ -26,24 +26,24 @@ def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, 
     return FrameReceiver(Scratch(), limit, budget), budget
 
 
-def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
+def feed(frame_receiver: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
     batches, position, turn = [], 0, 0
     while position < len(data):
-        buffer = one.buffer()
+        buffer = frame_receiver.buffer()
         count = min(len(buffer), cuts[min(turn, len(cuts) - 1)], len(data) - position)
         buffer[:count] = data[position : position + count]
         position, turn = position + count, turn + 1
-        batch = one.received(count)
+        batch = frame_receiver.received(count)
         if batch is not None:
             assert batch.last is not None
             batches.append((bytes(batch.view), batch.messages, batch.last))
     return batches
 
 
-def last_of(one: FrameReceiver, data: bytes) -> Batch:
-    feed(one, data[:-1], [SCRATCH])
-    one.buffer()[0] = data[-1]
-    batch = one.received(1)
+def last_of(frame_receiver: FrameReceiver, data: bytes) -> Batch:
+    feed(frame_receiver, data[:-1], [SCRATCH])
+    frame_receiver.buffer()[0] = data[-1]
+    batch = frame_receiver.received(1)
     assert batch is not None
     return batch
 
@@ -90,11 +90,11 @@ def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
 
 def test_the_scratch_area_moves_between_two_reads() -> None:
     scratch, first, other = Scratch(), bytearray(SCRATCH), bytearray(SCRATCH)
-    one = FrameReceiver(scratch, LIMIT, share(1 << 30))
+    frame_receiver = FrameReceiver(scratch, LIMIT, share(1 << 30))
     scratch.move(memoryview(first))
-    assert feed(one, frame(100, 1)[:50], [50]) == []
+    assert feed(frame_receiver, frame(100, 1)[:50], [50]) == []
     scratch.move(memoryview(other))
-    assert feed(one, frame(100, 1)[50:], [54]) == [(frame(100, 1), 1, 0)]
+    assert feed(frame_receiver, frame(100, 1)[50:], [54]) == [(frame(100, 1), 1, 0)]
     assert (bytes(first[:60]), bytes(other[:104])) == (frame(100, 1)[:50] + bytes(10), frame(100, 1))
 
 

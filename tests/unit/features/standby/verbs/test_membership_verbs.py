@@ -33,9 +33,9 @@ def join_first(out: str = "kit", *more: str, state: str = "first") -> None:
 
 
 def joined(state: str) -> Membership:
-    found = load_membership(path_of(Path(state)))
-    assert found is not None
-    return found
+    membership = load_membership(path_of(Path(state)))
+    assert membership is not None
+    return membership
 
 
 def write_epoch(state: str, epoch: int) -> Path:
@@ -153,9 +153,9 @@ def test_the_epoch_of_the_same_pair_is_kept(leaves: bool) -> None:
 
 
 def joined_secrets(path: str) -> list[str]:
-    found = load_membership(Path(path))
-    assert found is not None
-    return [found.witness_key, found.peer_key, found.key]
+    membership = load_membership(Path(path))
+    assert membership is not None
+    return [membership.witness_key, membership.peer_key, membership.key]
 
 
 def test_a_failed_write_leaves_neither_kit_nor_membership(monkeypatch: pytest.MonkeyPatch) -> None:

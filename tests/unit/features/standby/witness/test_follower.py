@@ -543,7 +543,7 @@ def written(folder: Path, **changes: object) -> Path:
         "listen": "10.0.0.1:7411",
         "fixed": "10.0.0.100",
         "ports": ["11311"],
-        "appliances": {name: {"address": one.address} for name, one in APPLIANCES.items()},
+        "appliances": {name: {"address": appliance.address} for name, appliance in APPLIANCES.items()},
         "followers": {"arm": {"address": "10.0.0.20", "key": KEY.hex()}},
         "follows_as": "arm",
         "state": str(folder / "epoch"),
