@@ -15,7 +15,7 @@ from examples.landshark.lab import Host, Lab
 from tests.support.adopted_robot import Robot, adoption, rosrv, until_taken
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession, need_ros
+from tests.support.nodes import RosSession
 from tests.support.rosmaster import PlainMaster
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(900)]
@@ -63,10 +63,9 @@ while True:
 
 
 @pytest.fixture
-def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
+def robot(host: Host, lab: Lab, tmp_path: Path) -> Iterator[Robot]:
     """A robot whose only honest companion is a second computer."""
-    need_ros()
-    host, nuc = lab.host("robot", "10.77.0.10/24"), lab.host("nuc", "10.77.0.11/24")
+    nuc = lab.host("nuc", "10.77.0.11/24")
     with (
         PlainMaster(tmp_path, host),
         RosSession("http://localhost:11311", tmp_path, host) as ros,
