@@ -99,11 +99,14 @@ def is_paid(context: Context, run: Callable[[], object]) -> bool:
         context.begin()
         gc.disable()  # the relay freezes most objects
         begun = thread_time()
+        sum(range(100_000)), [0] * 1_000_000  # 2 ms, unless the machine computes or gives memory slowly
+        slowness = max(1.0, (thread_time() - begun) / 0.002)
+        begun = thread_time()
         with suppress(FaultError):
             run()
         taken = thread_time() - begun
         gc.enable()
-        if taken <= 0.005 + (context.most - context.budget + 2 * context.turn.spent) * 1e-6:
+        if taken <= slowness * (0.005 + (context.most - context.budget + 2 * context.turn.spent) * 1e-6):
             return True
     return False
 
