@@ -258,9 +258,9 @@ def run_appliance(
         load_modules()
     if settings.relaying == "monitored":
         log.warning(
-            "relaying monitored: NO BOUNDARY. Only topics and services with a monitor or in [Monitor] are carried; "
-            "nodes negotiate the rest among themselves, past policy and monitors. It takes effect for a running "
-            "node when it reconnects",
+            "relaying monitored: NO BOUNDARY. Only topics and services with a monitor, or that [Monitor], [Limits], "
+            "[Authority] or ask name, are carried; nodes negotiate the rest among themselves, past policy and "
+            "monitors. It takes effect for a running node when it reconnects",
             mediation=settings.mediation,
         )
     raised = _weigh(pairing) if pairing is not None else 0

@@ -51,7 +51,6 @@ _STEADY_HZ = 5.0
 
 NOT_SUGGESTED = {
     "agree": "no name says which two velocities should be equal",
-    "diagnostics": "no name says which entries a motion needs",
     "hold_to_run": "no name says that a person has to hold a switch",
     "overspeed": "its limits follow from the base, which the graph does not show",
     "rate": "a rate follows from the driver, which the graph does not show",
