@@ -339,9 +339,9 @@ class _Writer:
         Proposals count, and guards in use unless they are disabled or broken; with `now`, only guards in force.
         """
         guards = {
-            (host.preset, host.topics.get("command"))
-            for host in self._loaded
-            if (host.state in _IN_FORCE if now else host.state not in ("off", "broken"))
+            (guard.preset, guard.topics.get("command"))
+            for guard in self._loaded
+            if (guard.state in _IN_FORCE if now else guard.state not in ("off", "broken"))
         } | {(one.preset, one.topics["command"]) for one in self.found if not now}
         bases, arms = self.graph.bases, [*self.graph.arm_velocities, *self.graph.arms]
         for commands, presets, what, help_ in (
