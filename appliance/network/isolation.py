@@ -99,6 +99,7 @@ _CANDIDATES = 64
 _TUNNELS = (PortRange.one(500), PortRange.one(4500))  # IKE; ESP in UDP
 _POOL = ipaddress.IPv4Network("10.111.0.0/16")
 _POOL6 = ipaddress.IPv6Network("fd52:4f53:5256::/48")
+_AN_HOUR = 3600.0
 _GLOBAL: dict[Family, str] = {4: "net/ipv4/ip_forward", 6: "net/ipv6/conf/all/forwarding"}
 
 
@@ -205,6 +206,7 @@ class Isolation:
         self._disturbed = DisturbedConnections(host, self.namespace, settings.link)
         self._protection = ""  # the rules of `rosrv protect` on this machine
         self.unprotected = ""  # why they are not in force again, after another program removed them
+        self._dropped: dict[str, tuple[int, float]] = {}  # by a rule's purpose: packets, and when they grew
         self._missing: list[str] = []  # rules that were missing, until `put_rules_back` has returned them
         self._lock: int | None = None
 
@@ -291,12 +293,18 @@ class Isolation:
             obstacles.append(f"{holder}, which leads to the appliance: give it another port")
         no_router = {_no_router(family): _GLOBAL[family].replace("/", ".") for family in self.ends}
         obstacles += [
-            f"{rule.purpose}, and drops packets: if containers, virtual machines or a hotspot send them, write"
-            f" `{no_router[rule.purpose]} = 1` into /etc/sysctl.d, and boot again"
+            f"{rule.purpose}, and dropped packets in the last hour: if containers, virtual machines or a hotspot send"
+            f" them, write `{no_router[rule.purpose]} = 1` into /etc/sysctl.d, and boot again"
             for rule in self.rules()
-            if rule.purpose in no_router and rule.packets
+            if rule.purpose in no_router and self._drops(rule)
         ]
         return tuple(obstacles)
+
+    def _drops(self, rule: FirewallRule) -> bool:
+        packets, time = self._dropped.get(rule.purpose, (0, -math.inf))
+        if rule.packets not in (0, packets):  # 0: they were put back
+            packets, time = self._dropped[rule.purpose] = rule.packets, clock.now()
+        return clock.now() < time + _AN_HOUR
 
     def forward_again(self) -> tuple[Family, ...]:
         """Enable the forwarding that another program has ended; return its families. Raises `NetworkError`."""

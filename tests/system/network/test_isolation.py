@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from appliance.base import clock
 from appliance.network import interfaces
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import INSIDE, Isolation, IsolationSettings
@@ -22,6 +23,7 @@ from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.port_holders import PortsInUseError
 from examples.landshark.lab import Host, Lab
 from tests.support.processes import runs
+from tests.support.virtual_clock import VirtualClock
 
 MASTER, FIRST, LAST = 11311, 20000, 20009
 
@@ -260,6 +262,8 @@ def test_obstacles_that_appear_later_are_named(lab: Lab, bare: Host, node: Host,
         with node.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
             one.sendto(b"?", (far.address, 9))
         assert "`net.ipv4.ip_forward = 1` into /etc/sysctl.d" in isolation.obstacles()[0]
+        with clock.using(VirtualClock(now=clock.now() + 3600)):
+            assert isolation.obstacles() == ()
         bare.namespace.sysctl("net.ipv4.ip_forward", "0")
         assert isolation.forward_again() == (4,)
         with serving(isolation.namespace, MASTER) as server:
