@@ -24,7 +24,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import Findings, PolicyError
 from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
-from appliance.policy.sections import ASK, BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
+from appliance.policy.sections import ASK, AUTHORITY, BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
 
 _MAX_LINES = 8  # the most lines that one grant may change, besides one for each right
 
@@ -91,7 +91,10 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest, unt
     while (
         missing := next((right for right in asked.rights if not _is_granted(policy, right)), None)
     ) is not None:
-        reason = decide_right(policy, missing).reason
+        decision = decide_right(policy, missing)
+        reason, rule = decision.reason, decision.rule
+        if rule is not None and rule.section == AUTHORITY:  # its line may be another one in the changed text
+            raise UngrantableError(f"no right grants it: {reason.replace(f' ({rule.file}:{rule.line})', '')}")
         if len(added) == most:
             raise UngrantableError(f"more than {most} lines would have to change: {reason}")
         text, line = _change(policy, text, missing, word, "" if added else asked.wide)

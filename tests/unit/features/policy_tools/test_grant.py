@@ -213,6 +213,14 @@ def test_a_request_that_no_policy_can_grant(host: str, category: str, resource: 
         changed(BASE, category, resource, host)
 
 
+def test_a_claim_to_a_command_group_is_no_right() -> None:
+    text = f"{BASE}[Authority]\nbase = /x\ntake base = 10.0.0.7\n"
+    with pytest.raises(
+        UngrantableError, match=r"no line of \[Authority\] base lets it take, override or ask$"
+    ):
+        changed(text, "publish", "/x", str(HOST))
+
+
 def test_failing_cases_are_reported() -> None:
     known = PolicyContext(
         cases_file="p.tests.yaml", cases="cases:\n  - {host: 10.0.0.9, node: /it, deny: [subscribe /z]}\n"
