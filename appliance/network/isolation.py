@@ -302,7 +302,7 @@ class Isolation:
 
     def _drops(self, rule: FirewallRule) -> bool:
         packets, time = self._dropped.get(rule.purpose, (0, -math.inf))
-        if rule.packets not in (0, packets):  # 0: they were put back
+        if rule.packets not in (0, packets):  # 0: they were restored
             packets, time = self._dropped[rule.purpose] = rule.packets, clock.now()
         return clock.now() < time + _AN_HOUR
 

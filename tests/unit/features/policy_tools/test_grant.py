@@ -213,7 +213,7 @@ def test_a_request_that_no_policy_can_grant(host: str, category: str, resource: 
         changed(BASE, category, resource, host)
 
 
-def test_a_claim_to_a_command_group_is_no_right() -> None:
+def test_a_right_gives_no_claim_to_a_command_group() -> None:
     text = f"{BASE}[Authority]\nbase = /x\ntake base = 10.0.0.7\n"
     with pytest.raises(
         UngrantableError, match=r"no line of \[Authority\] base lets it take, override or ask$"
