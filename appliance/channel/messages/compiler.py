@@ -28,10 +28,10 @@ class Contents(msgspec.Struct, frozen=True):
     each property of a monitor, and whether its automaton was proved equal to its formula. `places` maps a topic to
     `file:line:column`.
 
-    `unbuilt` has the monitors of files with errors. They do nothing; the relay holds their topics. `left_out` has the
-    files whose topics are not known; nothing holds their topics. `switches` has the words `on`, `shadow` and `off` of
-    monitors whose files have one. `givens` has the values in the compiled texts; that of a topic may differ from its
-    default.
+    `unbuilt` has the monitors of files with errors. They do nothing; the relay holds their topics, unless their code
+    `begins`. `left_out` has the files whose topics are not known; nothing holds their topics. `switches` has the words
+    `on`, `shadow` and `off` of monitors whose files have one. `givens` has the values in the compiled texts; that of a
+    topic may differ from its default.
     """
 
     monitors: dict[str, str] = {}
