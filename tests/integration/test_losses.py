@@ -226,13 +226,16 @@ def digest(site: Site) -> dict[str, Any]:
     }
 
 
+# Between calls roscpp keeps the connections of its last ones.
+_KEPT_BY_ROSCPP = {"socket:": 6, "connections to RVMaster and nodes": 6}
+
+
 def differences(before: Any, after: Any, at: str = "") -> Iterator[str]:
     if isinstance(before, Counter) and isinstance(after, Counter):
         yield from (
             f"{at} / {what}: {before[what]} → {number}"
             for what, number in after.items()
-            if number - before[what]
-            >= 6  # less is of the moment, as connections that roscpp keeps for its next calls
+            if number - before[what] >= _KEPT_BY_ROSCPP.get(what, 4)  # less is of the moment
         )
     elif isinstance(before, dict) and isinstance(after, dict):
         for key in sorted({*before, *after}):
