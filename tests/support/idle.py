@@ -4,12 +4,27 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 T = TypeVar("T")
+_NO_CODE = (lambda: None).__code__  # of methods in C
 
 
 def idle(part: type[T], **attributes: Any) -> T:
     made = idle_class(part)()
-    vars(made).update(attributes)
+    replace(made, **attributes)
     return cast(T, made)
+
+
+def replace(part: object, **attributes: Any) -> None:
+    """Set attributes of one object, each by a name that its class knows. So a renaming fails here as well."""
+    mro = type(part).__mro__
+    known = set(dir(part)).union(*(inspect.get_annotations(base) for base in mro))
+    for _, method in inspect.getmembers(type(part), inspect.isfunction):
+        known.update(inspect.unwrap(method).__code__.co_names)
+    for base in mro:
+        if init := vars(base).get("__init__"):
+            known.update(getattr(inspect.unwrap(init), "__code__", _NO_CODE).co_names)
+    if unknown := sorted(attributes.keys() - known):
+        raise AttributeError(f"{type(part).__name__} has no {', '.join(unknown)}")
+    vars(part).update(attributes)
 
 
 def idle_class(part: type[object]) -> Any:

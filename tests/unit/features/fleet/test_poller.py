@@ -17,7 +17,7 @@ from appliance.features.fleet.verified_bundles import (
 from appliance.formats.bundle_api import RobotReport
 from appliance.formats.bundle_archive import BundleContents
 from appliance.formats.terms import BundlePath
-from tests.support.idle import idle
+from tests.support.idle import idle, replace
 
 PATH = BundlePath("site-a", "arms", 7)
 TIME = 1_700_000_000.0
@@ -33,8 +33,8 @@ class Site:
         self.offered: list[tuple[str, str]] = []
         self.reported: list[RobotReport] = []
         bundles, connection = idle(VerifiedBundles), idle(CollectorConnection)
-        vars(bundles).update(fetch_selected=self._select, get=self._get)
-        vars(connection).update(put=self._put)
+        replace(bundles, fetch_selected=self._select, get=self._get)
+        replace(connection, put=self._put)
         self.poller = Poller(
             bundles, connection, (PATH.site, PATH.group), 60.0, lambda: self.stated, self._offer, lambda: TIME
         )

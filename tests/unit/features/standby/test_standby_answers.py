@@ -23,6 +23,7 @@ from appliance.features.standby.orders import on_standby
 from appliance.store.access_tokens import make_token
 from tests.support.answers import example
 from tests.support.asgi import requested
+from tests.support.idle import replace
 from tests.support.inline_loop import run
 
 STATE = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a", "address": "10.0.0.1"})
@@ -39,7 +40,7 @@ def control_link() -> ControlLink:
         return AdminAnswer(True, STATE) if wants_state else on_standby(STATE)
 
     link = ControlLink(lambda _tokens: None, lambda: None)
-    vars(link).update(ask=ask)
+    replace(link, ask=ask)
     return link
 
 

@@ -27,7 +27,7 @@ from appliance.features.tunnels import process
 from appliance.features.tunnels.charon import ViciClient
 from appliance.ipsec.requests import make_key
 from appliance.ipsec.strongswan import Proposals
-from tests.support.idle import idle
+from tests.support.idle import idle, replace
 
 pytestmark = pytest.mark.anyio
 
@@ -59,7 +59,7 @@ async def running(
 
 def charon_that(**methods: Callable[..., object]) -> ViciClient:
     client = idle(ViciClient)
-    vars(client).update(methods)
+    replace(client, **methods)
     return client
 
 
@@ -79,7 +79,7 @@ async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: py
         return []
 
     async def start(_tunnels: process.TunnelProcess, _wanted: TunnelsStated) -> ViciClient:
-        return charon_that(provision=provision, seen=seen)
+        return charon_that(provision=provision, list_tunnels=seen)
 
     def told(message: Any) -> None:
         if isinstance(message, TunnelsReported) and message.taken == 7:
@@ -114,7 +114,7 @@ async def test_no_report_is_older_than_the_changes_before_it(
         return []
 
     async def start(self: process.TunnelProcess, _wanted: TunnelsStated) -> ViciClient:
-        vici = charon_that(listen=listen, seen=seen)
+        vici = charon_that(listen=listen, list_tunnels=seen)
         asyncio.get_running_loop().run_in_executor(None, self._listen, vici)
         return vici
 
@@ -174,7 +174,7 @@ async def test_refusals_beyond_the_share_of_an_address_are_counted(
             load_key=lambda _key: None,
             provision=lambda _one: None,
             version=lambda: "6",
-            seen=list,
+            list_tunnels=list,
             listen=list,
         )
         charon.proposals = Proposals()

@@ -8,7 +8,7 @@ from appliance.features.tunnels.authority_verb import rotate_authority
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.supervisor.service_gate import Pairing
 from appliance.supervisor.state_directory import StateDirectory
-from tests.support.idle import idle
+from tests.support.idle import idle, replace
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_it_needs_a_stopped_single_appliance_with_an_authority(state: Path, tmp_
 
 def test_one_of_two_appliances_keeps_its_authority(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pair = idle(Pairing)
-    vars(pair).update(fixed_authority="end the pair first")
+    replace(pair, fixed_authority="end the pair first")
     monkeypatch.setattr("appliance.features.tunnels.authority_verb.pairing_in", lambda _state: pair)
     with pytest.raises(BackupError, match="end the pair first"):
         rotate_authority(state)

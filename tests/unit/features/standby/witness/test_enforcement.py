@@ -8,7 +8,7 @@ from appliance.features.standby.witness.firewall import LeaseFirewall
 from appliance.features.standby.witness.firewall_rules import nft_rules
 from appliance.features.standby.witness.idle_connections import IdleConnections
 from appliance.features.standby.witness.protocol import Left
-from tests.support.idle import idle
+from tests.support.idle import idle, replace
 from tests.unit.features.standby.witness.robot import PAIR_SETTINGS
 
 
@@ -61,7 +61,7 @@ class FakeProgram:
 
 def no_connections() -> IdleConnections:
     connections = idle(IdleConnections)
-    vars(connections).update(connecting=list)
+    replace(connections, connecting=list)
     return connections
 
 
