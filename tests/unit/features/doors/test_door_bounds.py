@@ -32,7 +32,7 @@ SHOWN = {
     "foxglove.FoxgloveLimits.calls": "100 of a client",
     "foxglove.FoxgloveLimits.parameters": "1000 for a client",
     "known_types.MAX_CHARACTERS": "400,000 characters",
-    "lookout._MAX_PROBES": "50 in two seconds",
+    "lookout._MAX_PROBES": "50 a second",
     "lookout._PROBE_SECONDS": "one second each",
     "lookout._AGAIN_SECONDS": "again after ten seconds",
     "door_node._LEARN_SECONDS": "one second each",
