@@ -44,9 +44,9 @@ _COLLECTOR_METRICS = (
 _BUNDLE_METRICS = (
     gauge(
         "rosrv_bundle_version",
-        "version of the bundle in force; 0 without one. Only robots of a fleet have this metric",
+        "version of the bundle in force; 0 without one. Only robots with bundles have this metric",
     ),
-    gauge("rosrv_bundle_refused", "1 while the last bundle that was offered is refused"),
+    gauge("rosrv_bundle_refused", "1 if a bundle was refused since the one in force"),
     gauge("rosrv_bundle_changed", "1 while a part of the bundle in force is changed on this robot"),
     gauge(
         "rosrv_bundle_checked_seconds", "since the collector's metadata were last verified, or -1 if not yet"

@@ -18,7 +18,7 @@ METRICS = (
     ),
     histogram("rosrv_decision_seconds", "time from a request's arrival to its decision"),
     histogram("rosrv_master_call_seconds", "time from a request's arrival to its answer", "call"),
-    gauge("rosrv_probe_failed", "1 while the ROS master is reachable without the appliance"),
+    gauge("rosrv_probe_failed", "1 while the ROS master is, or may be, reachable without the appliance"),
     gauge("rosrv_relay_connected", "1 while all relay processes are connected"),
     gauge("rosrv_relay_connections", "subscribers (topic) and clients (service) connected", "kind"),
     counter("rosrv_relay_messages_total", "messages relayed, by topic or service", "resource"),
