@@ -16,13 +16,12 @@ import contextlib
 import errno
 import fcntl
 import ipaddress
-import itertools
 import json
 import math
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -95,7 +94,6 @@ def _forget(family: int, port: int, own: set[str]) -> int:
 
 
 INSIDE = "eth0"
-_CANDIDATES = 64
 _TUNNELS = (PortRange.one(500), PortRange.one(4500))  # IKE; ESP in UDP
 _POOL = ipaddress.IPv4Network("10.111.0.0/16")
 _POOL6 = ipaddress.IPv6Network("fd52:4f53:5256::/48")
@@ -699,8 +697,9 @@ _Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 def _choose(pool: _Network, length: int, taken: list[_Network]) -> LinkAddresses:
-    candidates: Iterator[_Network] = iter(pool.subnets(new_prefix=length))
-    for candidate in itertools.islice(candidates, _CANDIDATES):
-        if not any(candidate.version == other.version and candidate.overlaps(other) for other in taken):
+    # A VPN's route around the whole pool serves all but the few addresses of the subnet, which is narrower.
+    rivals = [other for other in taken if other.overlaps(pool) and other.prefixlen >= pool.prefixlen]
+    for candidate in pool.subnets(new_prefix=length):
+        if not any(candidate.overlaps(other) for other in rivals):
             return LinkAddresses(str(candidate), str(candidate[1]), str(candidate[2]))
     raise NetworkError(f"isolation netns: this host has routes to all of {pool}")

@@ -117,6 +117,35 @@ def test_the_interface_name_fits() -> None:
     assert len(IsolationSettings(ports=SETTINGS.ports, name="a-rather-long-name").link) <= 15
 
 
+@pytest.mark.parametrize(
+    ("routes", "subnets"),
+    [
+        ([], ["10.111.0.0/30", "fd52:4f53:5256::/64"]),
+        (["10.111.0.0/30", "10.111.0.8/29"], ["10.111.0.4/30", "fd52:4f53:5256::/64"]),
+        (["10.111.0.0/24", "fd52:4f53:5256::/56"], ["10.111.1.0/30", "fd52:4f53:5256:100::/64"]),
+        (
+            ["0.0.0.0/1", "128.0.0.0/1", "2000::/3", "fc00::/7"],
+            ["10.111.0.0/30", "fd52:4f53:5256::/64"],
+        ),  # VPN
+        (["10.0.0.0/8", "10.111.0.1/32"], ["10.111.0.4/30", "fd52:4f53:5256::/64"]),
+        (["10.111.0.0/17", "10.111.128.0/17"], []),
+        (["10.111.0.0/16"], []),
+    ],
+)
+def test_no_route_of_the_host_keeps_the_appliance_from_starting(
+    routes: list[str], subnets: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    isolated = Isolation(Namespace.own(), SETTINGS)
+    monkeypatch.setattr(isolation.interfaces, "networks", lambda _namespace: routes)
+    monkeypatch.setattr(isolated._forwarding, "has_ipv6", lambda: True)
+    if subnets:
+        isolated._choose_subnets()
+        assert [isolated.ends[4].network, isolated.ends[6].network] == subnets
+    else:
+        with pytest.raises(NetworkError, match="routes to all"):
+            isolated._choose_subnets()
+
+
 _OPEN = "rosrv protect (NOT in force again)"
 
 
