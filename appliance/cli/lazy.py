@@ -4,6 +4,7 @@ import functools
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -165,13 +166,18 @@ class _Deferred(TyperCommand):
     ) -> "Context":
         command = load_command(self._verb, str(self.name))
         try:
-            return command.make_context(info_name, args, parent, **extra)
+            context = command.make_context(info_name, args, parent, **extra)
         except typer.BadParameter as error:
             from pydantic import ValidationError  # noqa: PLC0415  a correct command line does not need it
 
             if isinstance(error.__cause__, ValidationError):  # typer chains it
                 error.message = refusal(error.__cause__.errors()[0])
             raise
+        if Path("-") in context.params.values():
+            from appliance.cli.output import separate_data  # noqa: PLC0415  as above
+
+            separate_data(context)
+        return context
 
 
 def load_command(verb: Verb, name: str) -> "Command":

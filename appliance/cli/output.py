@@ -3,30 +3,70 @@
 Text from the network is printed without control characters and never as markup.
 """
 
+import errno
 import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
 from mmap import mmap
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, BinaryIO, TextIO, TypeVar
 
 import msgspec
 import typer
+from typer.core import TyperOption
 
 from appliance.api.front.moments import in_full
 from appliance.base import actors
-from appliance.base.atomic_files import NotLastingError, write_where_told
+from appliance.base.atomic_files import NotLastingError, name_to_make, write_where_told
 from appliance.base.timestamps import local_minute
 from appliance.base.user_errors import with_remedy
 from appliance.channel.answers.monitor_answers import Replaced
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
 
+if TYPE_CHECKING:
+    from typer._click import Context
+
 _T = TypeVar("_T")
 _GAP, _INDENT = "  ", "    "
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
+
+
+# The value `-` of `--output`, in all verbs: the data alone goes to standard output, and what the verb says to standard
+# error. A verb whose help does not offer it refuses it, and so does each other option with the name of a file.
+
+STANDARD_OUTPUT = Path("-")
+OR_STANDARD = "- for standard output"
+_data: ContextVar[TextIO] = ContextVar("data")
+
+
+def separate_data(context: "Context") -> None:
+    """Prepare an option with the value `-`, or exit with a usage error."""
+    for option in context.command.params:
+        if not isinstance(option, TyperOption) or context.params.get(option.name or "") != STANDARD_OUTPUT:
+            continue
+        name, verb = max(option.opts, key=len), context.command_path
+        if OR_STANDARD not in (option.help or ""):
+            raise usage_error(f"{name} - is not the name of a file: give one, such as {name} ./FILE", verb)
+        if context.params.get("as_json"):
+            raise usage_error(f"{name} - and --json both use standard output: give one", verb)
+        if sys.stdout.isatty():
+            raise usage_error(f"standard output is a terminal; redirect it: {name} - > FILE", verb)
+        context.with_resource(_separated())
+
+
+@contextmanager
+def _separated() -> Iterator[None]:
+    before = _data.set(sys.stdout)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _data.reset(before)
 
 
 def moment(seconds: float) -> str:
@@ -59,6 +99,10 @@ def refuse_beside_dry_run(verb: str, **given: object) -> None:
 
 def write_told(path: Path, data: bytes | mmap) -> None:
     """Write a file, and warn if a power cut may lose the data. Raises `OSError`."""
+    if path == STANDARD_OUTPUT:
+        with new_file(path) as file:
+            file.write(data)
+        return
     try:
         write_where_told(path, data)
     except NotLastingError as error:
@@ -68,11 +112,37 @@ def write_told(path: Path, data: bytes | mmap) -> None:
 def write_new(file: Path, text: str, *, verb: str) -> None:
     """Write a file that must not exist; otherwise exit with a usage error."""
     try:
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        with new_file(file, 0o644) as made:
+            made.write(text.encode())
     except OSError as error:
         raise usage_error(f"cannot write {with_remedy(error, file)}", verb=verb) from error
-    with os.fdopen(descriptor, "w", encoding="utf-8") as made:
-        made.write(text)
+
+
+@contextmanager
+def new_file(path: Path, mode: int = 0o600) -> Iterator[BinaryIO]:
+    """Make a file that must not exist; it gets its name when it is whole. Raises `OSError` with this name.
+
+    `STANDARD_OUTPUT` stands for standard output, to which the block writes directly.
+    """
+    if path == STANDARD_OUTPUT:
+        stream = _data.get(sys.stdout)
+        stream.flush()
+        yield stream.buffer
+        stream.buffer.flush()
+        return
+    if os.path.lexists(path):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    part = name_to_make(path)
+    try:
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+        with os.fdopen(descriptor, "wb") as file:
+            yield file
+        part.rename(path)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(part), part):  # such as a full disk
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
 
 
 def say_json(fields: msgspec.Struct | Mapping[str, object] | tuple[object, ...]) -> None:

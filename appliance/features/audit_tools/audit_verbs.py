@@ -1,14 +1,12 @@
 """`rosrv audit tail|search|show|verify|checkpoints|export`: review the audit log."""
 
 import json
-import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Annotated, Protocol, TextIO, TypeVar
+from typing import Annotated, BinaryIO, Protocol, TypeVar
 
 import msgspec
 import typer
@@ -48,6 +46,7 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import AuditSource, audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.output import OR_STANDARD, STANDARD_OUTPUT, new_file
 from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.unrecorded import unknown_names
 from appliance.features.views import pair_view
@@ -457,7 +456,10 @@ def _later(read: Callable[[int], list[SignedCheckpoint]], last: SignedCheckpoint
 def export(
     appliance: Appliance,
     *,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help=f"File, must not exist; {OR_STANDARD} (default)"),
+    ] = None,
     as_csv: Annotated[
         bool, typer.Option("--csv", help="CSV for a spreadsheet instead of NDJSON, without proofs")
     ] = False,
@@ -472,12 +474,11 @@ def export(
     wanted = _filter_of(appliance)
     source = audit_of(appliance.way)
     entries = _csv(source.export(wanted)) if as_csv else source.evidence(wanted)
-    with progress("exporting", source.last, shares_screen=output is None) as report:
-        if output is None:
-            count = _write_all(entries, report, sys.stdout)
-        else:
-            with _new_file(output) as file:
-                count = _write_all(entries, report, file)
+    with (
+        progress("exporting", source.last, shares_screen=output is None) as report,
+        new_file(output or STANDARD_OUTPUT) as file,
+    ):
+        count = _write_all(entries, report, file)
     if output is not None:
         note(f"{counted(count - as_csv, 'record')} in {output}")
 
@@ -515,23 +516,10 @@ def _print_lines(entries: list[LogEntry], appliance: Appliance) -> None:
     sys.stdout.flush()
 
 
-@contextmanager
-def _new_file(path: Path) -> Iterator[TextIO]:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    try:
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            yield file
-    except BaseException as error:
-        path.unlink()
-        if isinstance(error, OSError):  # such as a full disk: the error does not name the file
-            error.filename = error.filename or str(path)
-        raise
-
-
-def _write_all(lines: Iterable[tuple[int, str]], report: Callable[[int], None], file: TextIO) -> int:
+def _write_all(lines: Iterable[tuple[int, str]], report: Callable[[int], None], file: BinaryIO) -> int:
     count = 0
     for count, (sequence, line_of) in enumerate(lines, 1):
-        file.write(line_of + "\n")
+        file.write(f"{line_of}\n".encode("ascii"))
         if count % _PROGRESS_EVERY == 0:
             report(sequence)
     file.flush()

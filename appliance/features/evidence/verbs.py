@@ -1,11 +1,8 @@
 """The commands `rosrv evidence export|verify|verifier`."""
 
-import errno
-import os
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
@@ -14,14 +11,13 @@ import typer
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.filter_options import Since, Until
-from appliance.base.atomic_files import name_to_make
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.connection.admin_client import AdminSocket, RestProblemError
 from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import time_given
-from appliance.cli.output import Json, say_json, usage_error
+from appliance.cli.output import OR_STANDARD, Json, new_file, say_json, usage_error
 from appliance.features.evidence.bundle import (
     BundleError,
     RecordingSelection,
@@ -51,7 +47,9 @@ def export_evidence(
         ),
     ] = None,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="File (ZIP), must not exist")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=f"File (ZIP), must not exist; {OR_STANDARD}")
+    ],
     since: Since = None,
     until: Until = None,
 ) -> None:
@@ -67,38 +65,20 @@ def export_evidence(
         if (recording is None) is (since is None) or (recording is not None and until is not None):
             raise usage_error("give a recording, or --since (and --until)")
         span = TimeSpan(time_given("--since", since or "0s"), time_given("--until", until or "0s"))
-        size, part = 0, name_to_make(output)
-        if os.path.lexists(output):
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))
-        with _naming(output):
-            descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        size = 0
         try:
-            with os.fdopen(descriptor, "wb") as file:
+            with new_file(output) as file:
                 for piece in _bundle(appliance, recording or span):
-                    with _naming(output):
-                        size += file.write(piece)
-                        file.flush()
-            part.rename(output)
-        except BaseException as error:
-            part.unlink()
-            if isinstance(error, BundleError | RestProblemError):
-                fail(str(error), 1)
-            raise
+                    size += file.write(piece)
+                    file.flush()
+        except (BundleError, RestProblemError) as error:
+            fail(str(error), 1)
     if appliance.as_json:
         say_json({"file": str(output), "bytes": size})
     else:
         say(
             f"{output}: {size} bytes; verify it: python3 verify.py {shlex.quote(output.name)} --key audit.pub"
         )
-
-
-@contextmanager
-def _naming(output: Path) -> Iterator[None]:
-    """Let errors name the file that the operator named, not the unfinished one."""
-    try:
-        yield
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(output)) from error
 
 
 def _bundle(appliance: Appliance, wanted: str | TimeSpan) -> Iterator[bytes]:

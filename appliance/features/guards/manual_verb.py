@@ -7,7 +7,7 @@ import typer
 
 from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import say_diff, say_json, usage_error, write_told
+from appliance.cli.output import OR_STANDARD, say_diff, say_json, usage_error, write_told
 from appliance.features.guards.manual import Manual, changes, safety_manual
 from appliance.features.guards.requests import GuardSuggestionsWanted, GuardsWanted
 from rosmop.tool.terminal import say
@@ -20,7 +20,8 @@ def manual(
     appliance: Appliance,
     *,
     out: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write the manual to this file")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help=f"Write the manual to this file; {OR_STANDARD}"),
     ] = None,
     diff: Annotated[
         Path | None,

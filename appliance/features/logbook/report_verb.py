@@ -25,7 +25,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.output import say_json, usage_error, write_new
+from appliance.cli.output import OR_STANDARD, say_json, usage_error, write_new
 from appliance.features.logbook.log_source import Log, OpenedLogs, Other, logs_of
 from appliance.formats.interventions import READ
 from appliance.formats.machine_report import (
@@ -183,7 +183,10 @@ def report_interventions(
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="File for one HTML page without scripts; must not exist"
+            "--output",
+            "-o",
+            metavar="FILE",
+            help=f"File for one HTML page without scripts; must not exist; {OR_STANDARD}",
         ),
     ] = None,
 ) -> None:

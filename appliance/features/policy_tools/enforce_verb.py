@@ -14,7 +14,7 @@ from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import refuse_beside_dry_run, say_json, write_told
+from appliance.cli.output import OR_STANDARD, refuse_beside_dry_run, say_json, write_told
 from appliance.cli.standing import WITHIN, WhenStanding, Within, stand_or_exit
 from appliance.features.policy_tools.audit_only import (
     EnforcedAlreadyError,
@@ -84,7 +84,9 @@ def enforce(
     ] = "7d",
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="File for the changed policy; replaced if it exists"),
+        typer.Option(
+            "--output", "-o", help=f"File for the changed policy; replaced if it exists; {OR_STANDARD}"
+        ),
     ] = None,
     confirm_within: ConfirmWithin = None,
     when_standing: WhenStanding = False,

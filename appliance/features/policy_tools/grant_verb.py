@@ -24,7 +24,7 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_source import audit_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
-from appliance.cli.output import say_json, usage_error, write_told
+from appliance.cli.output import OR_STANDARD, say_json, usage_error, write_told
 from appliance.features.policy_tools.explanations import asks_policy, explained, grant_of
 from appliance.features.policy_tools.grant import UngrantableError
 from appliance.features.policy_tools.live_verbs import say_loaded
@@ -79,7 +79,9 @@ def grant(
     *,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="File for the changed policy; replaced if it exists"),
+        typer.Option(
+            "--output", "-o", help=f"File for the changed policy; replaced if it exists; {OR_STANDARD}"
+        ),
     ] = None,
     tool: Annotated[
         bool,

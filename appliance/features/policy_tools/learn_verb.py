@@ -1,6 +1,5 @@
 """The command `rosrv policy learn`."""
 
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -14,10 +13,9 @@ import yaml
 from appliance.audit.search.filter_options import Since
 from appliance.base.counted import counted
 from appliance.base.input_files import names_of_hosts
-from appliance.base.user_errors import with_remedy
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.output import say_json, write_told
+from appliance.cli.output import OR_STANDARD, STANDARD_OUTPUT, say_json, write_new, write_told
 from appliance.cli.output import usage_error as usage
 from appliance.features.policy_tools.audit_only import EnforceError, enforced_text
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, grant
@@ -292,7 +290,7 @@ def learn_policy(
         typer.Option(
             "--output",
             "-o",
-            help="File (default: standard output); must not exist, except with --ask, which continues it",
+            help=f"File; must not exist, except with --ask, which continues it; {OR_STANDARD} (default)",
         ),
     ] = None,
     tests: Annotated[
@@ -323,7 +321,7 @@ def learn_policy(
     Example: rosrv policy learn --state /var/lib/rosrv --output learned.ini
     """
     if ask:
-        if tests is not None or with_start or robot or output is None:
+        if tests is not None or with_start or robot or output is None or output == STANDARD_OUTPUT:
             raise usage_error("--ask needs --output FILE, and has none of --tests, --with-start and --robot")
         raise typer.Exit(ask_rights(appliance, recorded_period(appliance, since, host), output))
     members = _members(appliance, networks_of(robot))
@@ -340,7 +338,7 @@ def learn_policy(
     _check(learned, members, tests_wanted=tests is not None or appliance.as_json)
     for file, text in ((output, learned.text), (tests, learned.tests)):
         if file is not None:
-            _write(file, text)
+            write_new(file, text, verb="rosrv policy")
     if appliance.as_json:
         counts = {"requests": learned.requests, "left_out": learned.left_out}
         say_json(
@@ -412,12 +410,3 @@ def _busiest(learned: LearnedPolicy) -> str:
         f"{host} needs {count} of the {counted(len(crowd), 'key')}; learn from the other hosts"
         " (--host HOST for each), or write rules for these names by hand"
     )
-
-
-def _write(output: Path, text: str) -> None:
-    try:
-        descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-    except OSError as error:
-        raise usage_error(with_remedy(error, output)) from error
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(text)

@@ -2,9 +2,9 @@
 
 import hashlib
 import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import msgspec
@@ -21,7 +21,7 @@ from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, 
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span, time_given
 from appliance.cli.message_lines import lines_of
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import OR_STANDARD, STANDARD_OUTPUT, new_file, say_json, usage_error
 from appliance.features.recorder import requests as recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap
@@ -52,6 +52,7 @@ _Id = Annotated[
     ),
 ]
 _SECOND = 1_000_000_000
+_PIECE = 1 << 20  # bytes
 _BARS = " ▁▂▃▄▅▆▇█"
 _T = TypeVar("_T")
 
@@ -222,7 +223,9 @@ def fetch(
     *,
     out: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="File to write (default: rosrv-ID.bag)", show_default=False),
+        typer.Option(
+            "--output", "-o", help=f"File to write (default: rosrv-ID.bag); {OR_STANDARD}", show_default=False
+        ),
     ] = None,
     mcap: Annotated[
         bool, typer.Option("--mcap", help="As MCAP (rosrv-ID.mcap), for Foxglove and others")
@@ -233,24 +236,24 @@ def fetch(
     Example: rosrv record fetch 1879f3c2a4b5d6e7f012 --mcap
     """
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
-    if os.path.lexists(target):
+    if target != STANDARD_OUTPUT and os.path.lexists(target):
         raise usage_error(f"{target} already exists: remove it, or name another file with --output")
     body = appliance.ask_or_exit(recording_requests.RecordingWanted(recording))
-    part = name_to_make(target)
+    part = name_to_make(Path(gettempdir(), body.id) if target == STANDARD_OUTPUT else target)
     try:
         os.close(_private(part))
     except OSError as error:
         raise usage_error(f"cannot write {with_remedy(error, target)}") from None
     try:
         bag = bag_of(appliance, body.id, part)
-        if bag is not part:
-            shutil.copyfile(bag, part)
-        with part.open("rb") as file:
+        with bag.open("rb") as file:
             whole = hashlib.file_digest(file, "sha256").hexdigest() == body.sha256
-        if whole and mcap:
-            _convert(part, target)
-        elif whole:
-            part.replace(target)
+            if whole:
+                file.seek(0)
+                with new_file(target) as made:
+                    made.writelines(as_mcap(bag) if mcap else iter(lambda: file.read(_PIECE), b""))
+    except ValueError as error:
+        raise refusal([f"rosrv: cannot convert to MCAP: {error}; fetch the bag without --mcap"]) from None
     except OSError as error:
         raise usage_error(with_remedy(error, error.filename2 or error.filename or target)) from None
     finally:
@@ -352,20 +355,6 @@ def _draw(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
 def _private(path: Path) -> int:
     """Let only the owner read the file, because messages are private."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-
-
-def _convert(bag: Path, target: Path) -> None:
-    made = name_to_make(target)
-    with os.fdopen(_private(made), "wb") as file:
-        try:
-            file.writelines(as_mcap(bag))
-            file.flush()
-            made.rename(target)
-        except BaseException as error:
-            made.unlink()
-            if not isinstance(error, ValueError):
-                raise
-            raise refusal([f"rosrv: cannot convert to MCAP: {error}; fetch the bag without --mcap"]) from None
 
 
 def _seconds(option: str, given: str | None) -> float | None:

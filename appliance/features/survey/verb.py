@@ -11,7 +11,7 @@ import typer
 from appliance.base.counted import counted
 from appliance.base.input_files import names_of_hosts
 from appliance.cli.durations import bounded_span
-from appliance.cli.output import Json, say_json, usage_error, write_new
+from appliance.cli.output import OR_STANDARD, STANDARD_OUTPUT, Json, say_json, usage_error, write_new
 from appliance.features.survey.draft import DraftError, PolicyDraft, draft
 from appliance.formats.html_page import Cells, head, lines, section, text
 from appliance.policy.policy_findings import PolicyError
@@ -146,7 +146,8 @@ def survey(
         str, typer.Option(metavar="URI", envvar="ROS_MASTER_URI", help="The robot's ROS master")
     ] = "http://localhost:11311",
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File for one HTML page; must not exist")
+        Path | None,
+        typer.Option("--output", "-o", help=f"File for one HTML page; must not exist; {OR_STANDARD}"),
     ] = None,
     policy: Annotated[
         Path | None,
@@ -166,7 +167,7 @@ def survey(
     seconds = bounded_span("--within", within, "1s", "10m", _VERB)
     tests = None if policy is None else policy.with_name(f"{policy.name}.tests.yaml")
     for file in filter(None, (output, policy, tests)):
-        if file.exists():
+        if file != STANDARD_OUTPUT and file.exists():
             raise usage_error(f"{file} exists already: give the name of a new file", verb=_VERB)
     try:
         inventory = asyncio.run(read_graph(master, SurveyLimits(whole=seconds)))

@@ -4,7 +4,6 @@ import contextlib
 import functools
 import os
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion, output
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import bounded_span
-from appliance.cli.output import moment, say_json, say_row
+from appliance.cli.output import OR_STANDARD, STANDARD_OUTPUT, moment, new_file, say_json, say_row
 from appliance.features.tunnels.enrolment_kit import archive
 from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.requests import (
@@ -43,7 +42,6 @@ from rosmop.tool.terminal import printable, refusal, say
 # Enrolment cannot be undone, and a token is shown only once. So the file is created, and disk space reserved,
 # before the request is sent.
 
-_STANDARD_OUTPUT = Path("-")
 usage_error = functools.partial(output.usage_error, verb="rosrv host")
 _RESERVED = 64 << 10  # bytes; a kit needs about ten thousand
 
@@ -59,7 +57,7 @@ class Output:
 
     @property
     def is_standard(self) -> bool:
-        return self.path == _STANDARD_OUTPUT
+        return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:
         """If the data cannot be written, print `lost`, which has the remedy."""
@@ -72,23 +70,14 @@ class Output:
             raise refusal([f"rosrv: {self.path}: {error.strerror}; {lost}"]) from None
         self.written = True
 
-    def say(self, line: str) -> None:
-        if self.is_standard:
-            typer.echo(printable(line), err=True)
-        else:
-            say(line)
-
 
 @contextlib.contextmanager
-def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Output]:
+def new_output(out: Path | None, default: str) -> Iterator[Output]:
     """Existing files are never replaced, and a file that the block did not write is removed."""
     name = default.replace("/", "_")
-    if out == _STANDARD_OUTPUT:
-        if as_json:
-            raise usage_error("--output - and --json both use standard output: give one")
-        if sys.stdout.isatty():
-            raise usage_error("standard output is a terminal; redirect it: --output - > FILE")
-        yield Output(out, name, sys.stdout.buffer)
+    if out == STANDARD_OUTPUT:
+        with new_file(out) as file:
+            yield Output(out, name, file)
         return
     path = out or Path(name)
     with _open(path) as file:
@@ -180,12 +169,12 @@ def write_kit(
         }
         say_json(shown)
         return
-    output.say(f"{body.name} is enrolled as {body.address}, until {moment(body.expires)}")
+    say(f"{body.name} is enrolled as {body.address}, until {moment(body.expires)}")
     kit = "standard output" if output.is_standard else str(output.path)
-    output.say(f"its kit: {kit}" + ("" if key else " (without the private key, which the host has)"))
+    say(f"its kit: {kit}" + ("" if key else " (without the private key, which the host has)"))
     if reason:
-        output.say(_chosen(wishes.endpoint, reason))
-    output.say("on the host: unpack it, then run sudo ./join.sh")
+        say(_chosen(wishes.endpoint, reason))
+    say("on the host: unpack it, then run sudo ./join.sh")
 
 
 def _chosen(endpoint: str, reason: str) -> str:
@@ -206,7 +195,7 @@ def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None
         }
         say_json(shown)
         return
-    output.say(made.token)
+    say(made.token)
     if made.endpoint_reason:
         typer.echo(f"rosrv: {_chosen(made.endpoint, made.endpoint_reason)}", err=True)
     typer.echo(
@@ -255,8 +244,8 @@ _Out = Annotated[
     typer.Option(
         "--output",
         "-o",
-        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh); - for"
-        " standard output",
+        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh);"
+        f" {OR_STANDARD}",
     ),
 ]
 _Open = Annotated[
@@ -422,7 +411,7 @@ def _token_seconds(within: str | None, csr: Path | None, *, token: bool) -> floa
 def _write_kit(
     running: Appliance, order: HostAdd | HostRenew, csr: Path | None, wishes: KitOptions, out: Path | None
 ) -> None:
-    with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=running.as_json) as output:
+    with new_output(out, f"rosrv-{order.name}.tar.gz") as output:
         key, request = key_and_request(csr)
         wishes, reason = with_endpoint(running, wishes)
         body = running.ask_or_exit(structs.replace(order, request=request))
@@ -432,7 +421,7 @@ def _write_kit(
 def _write_script(running: Appliance, order: HostToken, wishes: KitOptions, out: Path | None) -> None:
     services = [str(service) for service in parse_services(wishes.opened)]
     asked = structs.replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=services)
-    with new_output(out, f"rosrv-{order.name}-join.sh", as_json=running.as_json) as output:
+    with new_output(out, f"rosrv-{order.name}-join.sh") as output:
         write_script(output, running.ask_or_exit(asked), as_json=running.as_json)
 
 
