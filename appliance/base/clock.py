@@ -81,3 +81,29 @@ def since_boot() -> float:
 
 def since_boot_ns() -> int:
     return _source.get().since_boot_ns()
+
+
+_STEP = 1.0  # seconds; a time service corrects less without a step
+
+
+class Began:
+    """When something began: its date follows a step of the system clock, so that the age of the thing stays right.
+
+    `at` is a date of the present system clock, in seconds since the epoch; None: now.
+    """
+
+    def __init__(self, at: float | None = None) -> None:
+        self._date = wall() if at is None else at
+        self._reading = since_boot() - (wall() - self._date)
+
+    def date(self) -> float:
+        """Return seconds since the epoch by the present system clock; without a step always the same number."""
+        found = wall() - (since_boot() - self._reading)
+        if abs(found - self._date) >= _STEP:
+            self._date = found
+        return self._date
+
+    def text(self) -> str:
+        """Return the date as RFC 3339, UTC, to the millisecond."""
+        date = datetime.fromtimestamp(self.date(), UTC)
+        return date.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -144,7 +144,7 @@ class StatusScreen:
         for line in map(in_local_zone, shorten(self.attention, _MAX_TROUBLES)):
             yield Text(f"attention: {line}", style=_YELLOW)
         yield _grid(self.body, self.host_in_words)
-        yield processes_table(self.body.processes, options.max_width)
+        yield processes_table(self.body.processes, options.max_width, self.body.now)
 
 
 def _grid(body: Status, host_in_words: HostInWords) -> Table:
@@ -152,7 +152,7 @@ def _grid(body: Status, host_in_words: HostInWords) -> Table:
     grid = Table.grid(padding=(0, 2))
     if body.name:
         grid.add_row("robot", body.name)
-    grid.add_row("appliance", f"{body.version} at {body.master}, for {age(body.since)}")
+    grid.add_row("appliance", f"{body.version} at {body.master}, for {age(body.since, body.now)}")
     isolation = Text(_isolation(body), style=_YELLOW if body.isolation == "none" else _GREEN)
     grid.add_row("isolation", isolation)
     lacking = missing_sandbox(body.processes)

@@ -157,7 +157,7 @@ class ProcessHandle:
         self.is_program = child.is_program
         self.pid = child.pid
         self.alive = True
-        self.since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        self.since = clock.Began()
         self.started = clock.now()
         self.answered: float | None = None
         self.sandbox: Walled | None = None

@@ -2,7 +2,7 @@
 
 import asyncio
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 
@@ -32,7 +32,7 @@ class ProcessSlot:
     wanted: bool = False  # for a role on demand: requested again since its last start
     dismissed: bool = False  # for a role on demand: killed, because control asked for its end
     pardoned: bool = False  # the supervisor ends this process because the appliance is not active any more
-    since: str = ""  # time of the last start
+    since: clock.Began = field(default_factory=clock.Began)  # the last start
     reason: str = ""  # why the last run ended, in the process's own words if it sent any
     output: tuple[str, ...] = ()  # the last output lines of its program
 

@@ -171,7 +171,7 @@ class Supervisor:
         self._tasks: set[asyncio.Task[None]] = set()
         self._unanswered = 0
         self._clock = messages.ClockRead(clock_is_synchronised())
-        self._since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        self._since = clock.Began()
 
     async def run(self) -> None:
         """Run until SIGTERM or SIGINT; SIGHUP reloads the policy. Raises `StartError`."""
@@ -770,7 +770,7 @@ class Supervisor:
 
     def _tell_processes(self) -> None:
         rows = [_about(slot) for slot in self.slots if slot.process is not None or slot.is_failing]
-        own = messages.ProcessInfo("supervisor", os.getpid(), self._since, 0)
+        own = messages.ProcessInfo("supervisor", os.getpid(), self._since.text(), 0)
         self._tell_control(messages.ProcessesChanged([own, *rows]))
 
     def _tell_control(self, message: messages.Message) -> None:
@@ -803,12 +803,13 @@ def _about(slot: ProcessSlot) -> messages.ProcessInfo:
     failing, output = (slot.reason, list(slot.output)) if slot.is_failing else ("", [])
     process, restarts = slot.process, slot.starts - 1
     if process is None:
-        return messages.ProcessInfo(slot.role.name, 0, slot.since, restarts, failing=failing, output=output)
+        since = slot.since.text()
+        return messages.ProcessInfo(slot.role.name, 0, since, restarts, failing=failing, output=output)
     sandbox, lacks = process.sandbox_state
     return messages.ProcessInfo(
         slot.role.name,
         process.pid,
-        process.since,
+        process.since.text(),
         restarts,
         sandbox,
         lacks,

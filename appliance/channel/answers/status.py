@@ -283,6 +283,9 @@ class Status(msgspec.Struct, frozen=True):
     new_state: Annotated[
         NewState | None, doc("the state directory, if it is younger than a day, otherwise null")
     ] = None
+    now: Annotated[
+        Moment | None, doc("the appliance's clock at this answer: the age of `since` is their difference")
+    ] = None
 
 
 if not TYPE_CHECKING:

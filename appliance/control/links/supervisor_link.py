@@ -8,8 +8,11 @@ import os
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 
+import msgspec
 import structlog
 
+from appliance.base import clock
+from appliance.base.timestamps import parse_date
 from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.channel import Channel, ChannelClosedError
@@ -38,13 +41,22 @@ class Surroundings:
     """
 
     def __init__(self) -> None:
-        self.processes: list[ProcessInfo] = []
+        self._processes: list[tuple[ProcessInfo, clock.Began]] = []
         self.firewall = messages.FirewallReported("unknown", FirewallState())
         self.machine: tuple[Address, ...] = ()  # addresses of the robot's machine
         self.probe = ""
         self.master = ""
         self.after_removal: list[Callable[[], None]] = []
         """Called when rules of the firewall are in force again that another program had removed."""
+
+    @property
+    def processes(self) -> list[ProcessInfo]:
+        """The last report, with the dates by the present system clock."""
+        return [msgspec.structs.replace(row, since=since.text()) for row, since in self._processes]
+
+    @processes.setter
+    def processes(self, rows: list[ProcessInfo]) -> None:
+        self._processes = [(row, clock.Began(parse_date(row.since) / 1e9)) for row in rows]
 
 
 class SupervisorQuestions:

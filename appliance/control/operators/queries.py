@@ -10,7 +10,7 @@ import msgspec
 from msgspec.structs import asdict
 
 import appliance
-from appliance.base.clock import now, wall
+from appliance.base.clock import Began, now, wall
 from appliance.base.validation_messages import meant
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import (
@@ -279,7 +279,7 @@ class Queries:
     handled: Callable[[Status], Status]
     new_state: Callable[[], NewState | None]
     name: str = ""
-    started: float = field(default_factory=wall)
+    started: Began = field(default_factory=Began)
     began: float = field(default_factory=now)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
@@ -332,7 +332,7 @@ class Queries:
         return Status(
             name=self.name,
             version=appliance.__version__,
-            since=self.started,
+            since=self.started.date(),
             master=self.surroundings.master,
             processes=self.surroundings.processes,
             isolation=self.surroundings.firewall.isolation,
@@ -358,6 +358,7 @@ class Queries:
             blocks=self.blocks(),
             starting=now() - self.began < _START_SECONDS,
             new_state=self.new_state(),
+            now=wall(),
             last_minute=MinuteState(
                 sum(meter.denied.counts().values()),
                 meter.dropped.counts(),

@@ -134,7 +134,7 @@ class CountedClient:
         self.session = session
         self.ticket = ticket
         self.peer = peer
-        self._since = clock.wall()
+        self._since = clock.Began()
         self._queues = queues
         self._samples: deque[_Counts] = deque([_Counts(0, 0, 0)], maxlen=_SAMPLES)
 
@@ -150,7 +150,7 @@ class CountedClient:
 
     def describe(self) -> ClientShown:
         lately = (now - before for now, before in zip(self._counts(), self._samples[0], strict=True))
-        return ClientShown(self.peer, self.ticket, self.session.protocol_name, self._since, *lately)
+        return ClientShown(self.peer, self.ticket, self.session.protocol_name, self._since.date(), *lately)
 
 
 def describe_clients(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:

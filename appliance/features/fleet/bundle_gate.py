@@ -192,6 +192,7 @@ class BundleGate:
         self.link = Link(self._heard)
         self._record = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=BundleRecord)
         self._poll = BundlePollReported()
+        self._checked: clock.Began | None = None
         self._stated: BundleStated | None = None
         self._stated_to: object = None
         self._offered: BundleOffered | None = None
@@ -218,7 +219,7 @@ class BundleGate:
             refused="" if record.refused is None else record.refused.path,
             reason="" if record.refused is None else record.refused.reason,
             changed=self._changed,
-            checked=self._poll.checked or None,
+            checked=None if self._checked is None else self._checked.date(),
             trouble=trouble,
             rejected=self._poll.rejected,
             for_order=self._waiting_for_order,
@@ -266,6 +267,8 @@ class BundleGate:
     def _on_report(self, message: BundlePollReported) -> None:
         if message.rejected and message.trouble != self._poll.trouble:
             self._trail.happened("bundle metadata rejected", message.trouble, collector=self._fleet.collector)
+        if message.checked != self._poll.checked:
+            self._checked = clock.Began(message.checked)
         self._poll = message
 
     def _state(self) -> None:

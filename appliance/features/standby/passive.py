@@ -285,7 +285,7 @@ class PassiveControl:
         self._lifeline = lifeline
         self._lease = lease
         self._folder = settings.state / "control"
-        self._since = clock.wall()
+        self._since = clock.Began()
         self._replica = Replica(
             self._folder / "state.db",
             SCHEMA,
@@ -416,7 +416,7 @@ class PassiveControl:
             self._membership,
             lease,
             role="standby",
-            since=self._since,
+            since=self._since.date(),
             other=other,
             obstacle=self.obstacle,
         )

@@ -251,7 +251,7 @@ class Replication:
         self._membership = membership
         self._lease = lease
         self._database = database
-        self._since = clock.wall()
+        self._since = clock.Began()
         self.switchover_wanted = asyncio.Event()
         self.sender = ReplicationSender(database, lambda: epoch, switchover_wanted=self.switchover_wanted.set)
         context = replication_context(membership, folder, server=True)
@@ -332,7 +332,7 @@ class Replication:
             self._membership,
             lease,
             role="active",
-            since=self._since,
+            since=self._since.date(),
             other=other,
             obstacle=lag.obstacle,
         )
