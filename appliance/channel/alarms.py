@@ -32,6 +32,7 @@ _CORE_KINDS = {
     "relay": AlarmKind("alarm", "read why it is away: its topics carry nothing"),
     "process-failing": AlarmKind("alarm", "read what it printed last"),
     "rosmaster": AlarmKind("warning", "wait: calls wait also"),
+    "token-ends": AlarmKind("warning", "rotate it, or revoke it if nobody needs it"),
     "audit-degraded": AlarmKind("warning", "check the disk, the load and the process signer"),
     "forgotten": AlarmKind("alarm", "enable the protection again, or remove it"),
     "monitor-off": AlarmKind("warning", "enable it again, unless it should be off"),
@@ -146,6 +147,9 @@ def _system(status: Status) -> Iterator[_Condition]:
         yield "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
     if audit.degraded is not None:
         yield "audit-degraded", "audit", audit.degraded
+    for token in status.tokens_ending:
+        text = f"the token {token.name} ({token.role}) ends at {_moment(token.expires)}"
+        yield f"token-ends:{token.name}", "system", f"{text}: rosrv token rotate {shlex.quote(token.name)}"
 
 
 def _policy(status: Status) -> Iterator[_Condition]:

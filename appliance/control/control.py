@@ -517,6 +517,7 @@ class Control:
             blocks=self.hosts.blocks.state,
             handled=self.handled.with_marks,
             new_state=self.state_age.state,
+            tokens_ending=self.tokens.ending,
             name=self.settings.name,
         )
 

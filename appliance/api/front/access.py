@@ -15,6 +15,7 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import cast
 
 from appliance.api.front.problems import ProblemError, too_many
@@ -87,7 +88,7 @@ class TokenAuthenticator:
     def state(self, tokens: Iterable[TokenKept]) -> None:
         self._tokens = {token.id: token for token in tokens}
         # No step of the clock changes an end. Control states the tokens again when one has ended.
-        dates = {token.id: token.expires for token in self._tokens.values()}
+        dates = {token.id: token.expires for token in self._tokens.values() if not token.ended}
         boot = clock.wall() - clock.since_boot()
         known = {token: end for token, end in self._ends.items() if end[0] == dates.get(token)}
         self._ends = {token: (date, date - boot) for token, date in dates.items()} | known
@@ -145,7 +146,10 @@ class TokenAuthenticator:
                 self._remember(peer_key(host))
                 self._report_use(kept.id)
                 return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)
-            raise self._refusal("the token has expired: ask for a new one (rosrv token add)")
+            end = datetime.fromtimestamp(kept.expires, UTC).isoformat(sep=" ", timespec="seconds")
+            raise self._refusal(
+                f"the token {kept.name} ended at {end}: ask an admin for a new one (rosrv token add)"
+            )
         failures = self._unknown if kept is None else self._wrong
         _require_patience(failures, host)
         failures.take(host, clock.now())

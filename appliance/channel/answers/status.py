@@ -9,6 +9,7 @@ import msgspec
 
 from appliance.channel.answers.field_docs import Moment, RevisionNote, RevisionNumber, Who, doc
 from appliance.channel.answers.host_answers import PortsSeen
+from appliance.channel.answers.token_answers import TokenEnding
 from appliance.features.views import with_states
 
 
@@ -283,6 +284,7 @@ class Status(msgspec.Struct, frozen=True):
     new_state: Annotated[
         NewState | None, doc("the state directory, if it is younger than a day, otherwise null")
     ] = None
+    tokens_ending: Annotated[list[TokenEnding], doc("access tokens that end within a week")] = []
     now: Annotated[
         Moment | None, doc("the appliance's clock at this answer: the age of `since` is their difference")
     ] = None

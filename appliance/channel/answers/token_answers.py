@@ -19,6 +19,14 @@ def may(held: str, least: TokenRole) -> bool:
     return held == least if least == "investigator" else _RANKS[held] >= _RANKS[least]
 
 
+class TokenEnding(msgspec.Struct, frozen=True):
+    """A token that ends within a week, without a later one of its name."""
+
+    name: Name
+    role: Annotated[TokenRole, doc("role, which decides its rights")]
+    expires: Moment
+
+
 class Token(msgspec.Struct, frozen=True):
     """A token without its secret; times are seconds since the epoch."""
 

@@ -70,9 +70,10 @@ class ConnectionAnswered(Message):
 
 
 class TokenKept(msgspec.Struct, frozen=True):
-    """A usable token, without its secret; `expires` is seconds since the epoch.
+    """A token without its secret, usable or `ended`; `expires` is seconds since the epoch.
 
-    The hash of the reading key, `reading`, is empty for tokens of an early version.
+    An ended one is only refused, with the reason. The hash of the reading key, `reading`, is empty for tokens of an
+    early version.
     """
 
     id: str
@@ -82,10 +83,11 @@ class TokenKept(msgspec.Struct, frozen=True):
     hash: bytes
     expires: float
     reading: bytes = b""
+    ended: bool = False
 
 
 class TokensStated(Message):
-    """All usable tokens and all blocked hosts, at the start of a link and after every change."""
+    """All usable tokens, the latest ended ones, and all blocked hosts: at the start, and after every change."""
 
     tokens: list[TokenKept]
     blocked: list[str] = msgspec.field(default_factory=list)

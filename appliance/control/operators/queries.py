@@ -37,6 +37,7 @@ from appliance.channel.answers.status import (
     Status,
     SwitchedOff,
 )
+from appliance.channel.answers.token_answers import TokenEnding
 from appliance.configuration.inventory import inventory as product_inventory
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
@@ -278,6 +279,7 @@ class Queries:
     blocks: Callable[[], BlocksState]
     handled: Callable[[Status], Status]
     new_state: Callable[[], NewState | None]
+    tokens_ending: Callable[[], list[TokenEnding]]
     name: str = ""
     started: Began = field(default_factory=Began)
     began: float = field(default_factory=now)
@@ -358,6 +360,7 @@ class Queries:
             blocks=self.blocks(),
             starting=now() - self.began < _START_SECONDS,
             new_state=self.new_state(),
+            tokens_ending=self.tokens_ending(),
             now=wall(),
             last_minute=MinuteState(
                 sum(meter.denied.counts().values()),

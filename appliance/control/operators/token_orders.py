@@ -8,6 +8,8 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import Protocol, cast
 
+from msgspec import structs
+
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
@@ -43,6 +45,8 @@ _LEAST_SECONDS = 30.0  # between two stored uses of a token; an api that works r
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MAX = 1000
+_MAX_ENDED = 100
+_WARNED_SECONDS = 7 * 86_400.0
 _SAME_DATE = 2.0  # seconds; a smaller difference is not shown
 
 
@@ -81,6 +85,23 @@ class TokenOrders:
         """Return the usable tokens, as the api gets them; the api also checks `expires`."""
         tokens = {row.id: self._date(row) for row in self._rows.values() if self._is_usable(row)}
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
+
+    def ended(self) -> list[TokenKept]:
+        """Return the latest tokens that ended by themselves: the api tells their owners."""
+        rows = [row for row in self._rows.values() if row.revoked is None and not self._is_usable(row)]
+        latest = sorted(rows, key=lambda row: row.expires)[-_MAX_ENDED:]
+        return [structs.replace(kept_by_api(row), ended=True) for row in latest]
+
+    def ending(self) -> list[answers.TokenEnding]:
+        """Return the tokens that end within a week, unless they were made for a short time or are rotated."""
+        usable = [row for row in self._rows.values() if self._is_usable(row)]
+        lasting = {row.name: row for row in sorted(usable, key=lambda row: row.expires)}
+        return [
+            answers.TokenEnding(row.name, cast(answers.TokenRole, row.role), self._date(row).expires)
+            for row in lasting.values()
+            if row.expires - row.created >= 2 * _WARNED_SECONDS
+            and (self._ends.time_left(TOKENS, row.id) or 0.0) < _WARNED_SECONDS
+        ]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         row = self._rows.get(token_id)

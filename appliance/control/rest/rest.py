@@ -274,7 +274,8 @@ class RestLink:
         )
 
     def state_tokens(self) -> None:
-        self._send(TokensStated(self._tokens.usable(), [*map(str, self._uses.blocked())]))
+        tokens = [*self._tokens.usable(), *self._tokens.ended()]
+        self._send(TokensStated(tokens, [*map(str, self._uses.blocked())]))
 
     def _send_answer(self, number: int, answer: AdminAnswer[object]) -> None:
         self._withdrawn.pop(number, None)

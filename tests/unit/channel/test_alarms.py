@@ -52,6 +52,13 @@ def test_a_healthy_appliance_has_none() -> None:
         ("monitors.folder_refused", "a.rv:1:1: no", "monitors-folder-refused", "alarm", "monitors"),
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
+        (
+            "tokens_ending",
+            [{"name": "alice", "role": "admin", "expires": 1.0}],
+            "token-ends:alice",
+            "warning",
+            "system",
+        ),
         ("blocks.hosts", 1, "hosts-blocked", "notice", "hosts"),
         (
             "processes",

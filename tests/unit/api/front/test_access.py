@@ -87,6 +87,22 @@ def test_an_expired_token_is_refused() -> None:
     assert recognise(door, f"Bearer {text}") == 401
 
 
+@pytest.mark.parametrize("back", [0.0, 86_400.0])
+def test_the_owner_of_an_ended_token_learns_that_it_has_ended(back: float) -> None:
+    with using(machine := VirtualClock(wall=1_795_164_925.0)):
+        row, text = make_token("alice", "admin", now=clock.wall() - 100, seconds=50)
+        machine.set_wall(clock.wall() - back)
+        door = TokenAuthenticator(10, lambda _token: None)
+        door.state([msgspec.structs.replace(kept(row), ended=True)])
+        for _ in range(2):
+            with pytest.raises(ProblemError, match="the token alice ended at 2026-11-20 08:54:35") as refused:
+                run(door.recognise(f"Bearer {text}", "10.0.0.1"))
+            assert refused.value.status == 401
+        wrong = text[:-4] + ("aaaa" if text[-4:] != "aaaa" else "bbbb")
+        with pytest.raises(ProblemError, match="wrong or revoked"):
+            run(door.recognise(f"Bearer {wrong}", "10.0.0.1"))
+
+
 def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyPatch) -> None:
     row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     checks: list[str] = []

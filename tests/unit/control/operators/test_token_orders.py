@@ -346,3 +346,32 @@ async def test_a_rotation_needs_room_only_for_a_further_token(
         await tokens.rotate(TokenRotate("alice", grace=60))
     await tokens.rotate(TokenRotate("alice"))
     assert sorted(one.name for one in tokens.usable()) == ["alice", "bob"]
+
+
+async def test_the_end_of_each_lasting_token_is_told_a_week_before(lives: Lives) -> None:
+    day = 86_400.0
+    with using(VirtualClock()):
+        tokens = lives.next()
+        for name, days in (("alice", 90), ("script", 90), ("guest", 3)):
+            await tokens.add(TokenAdd(name, "admin", days * day))
+        let_time_pass(2.9 * day)
+        assert tokens.ending() == [], "guest was made for three days"
+        let_time_pass(80.2 * day)
+        assert [(one.name, one.role) for one in tokens.ending()] == [("alice", "admin"), ("script", "admin")]
+        await tokens.rotate(TokenRotate("script", 90 * day, 2 * day))
+        assert [one.name for one in tokens.ending()] == ["alice"]
+        await tokens.revoke(TokenRevoke("alice"))
+        assert tokens.ending() == []
+
+
+async def test_only_what_ended_by_itself_is_called_ended(lives: Lives) -> None:
+    with using(VirtualClock()):
+        tokens = lives.next()
+        for name in ("alice", "bob", "carol"):
+            await tokens.add(TokenAdd(name, "viewer", 3600.0 if name == "alice" else 7200.0))
+        await tokens.revoke(TokenRevoke("bob"))
+        assert tokens.ended() == []
+        let_time_pass(3601.0)
+        for one in (tokens, lives.next()):
+            assert [(kept.name, kept.ended) for kept in one.ended()] == [("alice", True)]
+            assert [kept.name for kept in one.usable()] == ["carol"]

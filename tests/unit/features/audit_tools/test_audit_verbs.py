@@ -18,8 +18,9 @@ import pytest
 import appliance
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
+from appliance.cli.output import new_file
 from appliance.features.audit_tools import audit_verbs
-from appliance.features.audit_tools.audit_verbs import _checkpoints, _new_file
+from appliance.features.audit_tools.audit_verbs import _checkpoints
 from appliance.features.audit_tools.unrecorded import CATEGORIES
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category
@@ -162,8 +163,8 @@ def test_tail_follows(state: Path) -> None:
 def test_an_export_is_private(tmp_path: Path) -> None:
     before = os.umask(0o022)
     try:
-        with _new_file(tmp_path / "week.ndjson") as file:
-            file.write("{}\n")
+        with new_file(tmp_path / "week.ndjson") as file:
+            file.write(b"{}\n")
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "week.ndjson").stat().st_mode) == 0o600
