@@ -324,6 +324,7 @@ class Control:
             refusals=_REFUSALS_OF_A_ROBOT if self.role.paired else _REFUSALS,
             shut_out=self.role.in_doubt,
             connects=self.carried.connects,
+            own_silent=lambda: self.lifeline.say(messages.NodeSilent("rosout")),
         )
 
     def _own_call(self, asked: OwnCall) -> Awaitable[OwnAnswer]:

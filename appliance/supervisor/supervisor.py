@@ -85,6 +85,7 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.CompilerWanted,
     messages.ProcessWanted,
     messages.ProcessOverdue,
+    messages.NodeSilent,
     messages.OwnNetworkWanted,
     messages.MachineWorkWanted,
     messages.EndAgreed,
@@ -430,12 +431,14 @@ class Supervisor:
                 log.warning("control requests the shutdown of the appliance", reason=reason)
                 self.stop()
             case _:
-                self._feature_said(process, message)
+                self._said_further(process, message)
 
-    def _feature_said(self, process: ProcessHandle, message: messages.Message) -> None:
+    def _said_further(self, process: ProcessHandle, message: messages.Message) -> None:
         match message:
             case messages.MachineWorkWanted(number, _feature, work, terms):
                 self._answer(process, self._carry_out(process, number, work, terms))
+            case messages.NodeSilent(role):
+                self._end_silent(role)
             case messages.OwnNetworkWanted(network, ports):
                 self._answer(process, self._open_own_network(process, network, ports))
             case messages.EndAgreed():
@@ -628,6 +631,13 @@ class Supervisor:
                 slot.dismissed = True
                 slot.process.kill()
 
+    def _end_silent(self, role: str) -> None:
+        for slot in self.slots:
+            # The supervisor asks all others itself.
+            alone = slot.role.program is not None and not slot.role.asks
+            if slot.role.name == role and alone and slot.process is not None:
+                _kill_silent(slot.process)
+
     def _spawn(self, work: Coroutine[object, object, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
@@ -683,10 +693,7 @@ class Supervisor:
         else:
             process.ping()
         if process.is_hanging:
-            if process.reason != _UNANSWERED:
-                log.error("process does not answer and is killed", role=process.role, pid=process.pid)
-            process.reason = _UNANSWERED
-            process.kill()
+            _kill_silent(process)
 
     def _ask(self, process: ProcessHandle) -> None:
         if self._asking is None or self._asking.done():
@@ -797,6 +804,13 @@ class Supervisor:
 def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
     # A defect in one callback must not stop the robot's master: log the defect and continue.
     log.critical("fault in the supervisor", fault=context["message"], exc_info=context.get("exception"))
+
+
+def _kill_silent(process: ProcessHandle) -> None:
+    if process.reason != _UNANSWERED:
+        log.error("process does not answer and is killed", role=process.role, pid=process.pid)
+    process.reason = _UNANSWERED
+    process.kill()
 
 
 def _about(slot: ProcessSlot) -> messages.ProcessInfo:

@@ -223,6 +223,12 @@ class ProcessOverdue(Message):
     index: int
 
 
+class NodeSilent(Message):
+    """Restart a program that is a ROS node, such as rosout: control got no answer from its node."""
+
+    role: str
+
+
 class OwnNetworkWanted(Message):
     """Control asks for a network that only the appliance itself may use, and for open TCP ports.
 
@@ -331,7 +337,7 @@ Lifeline = (
     | SocketsRestored | Announced | ProcessesChanged | ProcessDied | ClockRead | MachineAddresses | FirewallReported
     | RulesRestored
     | ProbeFailed | ProbePassed | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
-    | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
+    | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue | NodeSilent
     | OwnNetworkWanted | OwnNetworkOpened
     | MachineWorkWanted | MachineWorkDone | EndAnnounced | EndAgreed
     | MemoryGiven | StateGiven | HeartbeatGiven | HeartbeatLineWanted | RouteFound | LogHeld | CompilerWanted

@@ -135,7 +135,8 @@ class Liveness:
     """Checks nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of others.
 
     A node that refuses `refusals` connections in a row is lost, unless the robot's firewalls may shut out this one of
-    two appliances (`shut_out`). `connects` returns whether a name of a host has a connection to a relay.
+    two appliances (`shut_out`). `own_silent()` is called when rosout, the appliance's own node, hangs. `connects`
+    returns whether a name of a host has a connection to a relay.
     """
 
     registry: Registry
@@ -150,6 +151,7 @@ class Liveness:
     refusals: int
     shut_out: Callable[[], bool]
     connects: Callable[[Address, str], bool]
+    own_silent: Callable[[], object]
 
     def __post_init__(self, quota_class: Callable[[Address], QuotaClass]) -> None:
         self._answered: dict[str, float] = {}
@@ -265,6 +267,10 @@ class Liveness:
             if not connected and now - max(since, incarnation.touched) >= self.settings.silent:
                 self._lose(incarnation, f"{why}, and it has no connection to a relay")
         elif refused or (not there and now - since >= self.settings.silent):
+            if (
+                incarnation.own and not refused
+            ):  # otherwise its process has ended, and the next one starts already
+                self.own_silent()
             self._lose(incarnation, why)
         elif there:
             self._make_up(incarnation)

@@ -14,6 +14,7 @@ from appliance.channel.messages import (
     Announced,
     CompilerWanted,
     EndAgreed,
+    NodeSilent,
     ProcessDied,
     ProcessOverdue,
     ProcessWanted,
@@ -27,6 +28,7 @@ from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.machine_work import NoMachineWork
 from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.role import Facts, Role
+from appliance.supervisor.roles import ROLES
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 from tests.support.memory_child import MemoryChild
 
@@ -153,6 +155,15 @@ async def test_control_may_have_only_a_process_on_demand_killed(made: Make) -> N
     master = child_in(supervisor.slots[0], supervisor)
     supervisor.control_said(MemoryChild().handle, ProcessOverdue("rosmaster", 0), ())
     assert not master.is_killed
+
+
+async def test_control_may_only_call_a_node_silent_that_the_supervisor_cannot_ask(made: Make) -> None:
+    supervisor = made(*(role for role in ROLES if not role.indexed))
+    children = {slot.role.name: child_in(slot, supervisor) for slot in supervisor.slots}
+    for name in children:
+        supervisor.control_said(MemoryChild().handle, NodeSilent(name), ())
+    assert [name for name, child in children.items() if child.is_killed] == ["rosout"]
+    assert children["rosout"].handle.reason == "the supervisor killed it, because it did not answer"
 
 
 @pytest.mark.parametrize("wanted", [False, True])

@@ -54,6 +54,24 @@ async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytes
         running.cancel()
 
 
+@pytest.mark.parametrize(("own", "ended"), [(True, False), (True, True), (False, False)])
+async def test_only_a_rosout_that_hangs_is_restarted(
+    monkeypatch: pytest.MonkeyPatch, *, own: bool, ended: bool
+) -> None:
+    """Another node is not ours, and the supervisor restarts a process that has ended."""
+    monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
+    world, node = await with_a_node()
+    told: list[str] = []
+    world.liveness.own_silent = lambda: told.append("silent")
+    node.own = own
+    if ended:
+        world.nodes.gone = {"/n"}
+    else:
+        world.nodes.silent = {"/n"}
+    await world.look(node)
+    assert (node.life, told) == (Life.SHADOW, ["silent"] * (own and not ended))
+
+
 async def test_a_refusal_of_a_robot_that_shuts_out_loses_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
     world = ControlParts(silent=3600.0)
