@@ -362,8 +362,7 @@ class Policy:
             order = group.order(request.host, self.atoms_of(request.host), holder)
             told = f"{may_not} while it does not hold {group.name}: {order}"
             return Decision(False, group.rule, told + now, told=told)
-        reason = f"{decision.reason}, while it holds {group.name}{now}"
-        return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
+        return _extend(decision, f", while it holds {group.name}{now}")
 
     def _apply_rank(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
         """Deny calls: only messages have a rank."""
@@ -371,8 +370,7 @@ class Policy:
             told = f"{self._what(request, 'may not')}: {group.name} has a rank, which services cannot have"
             return Decision(False, group.rule, told)
         line = " > ".join(group.in_words(rank) for rank in range(len(group.ranks)))
-        reason = f"{decision.reason}, while it moves and no higher rank of {group.name} does: {line}"
-        return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
+        return _extend(decision, f", while it moves and no higher rank of {group.name} does: {line}")
 
     def _decide_named_only(self, request: Request, table: RuleTable, rule: CompiledRule | None) -> Decision:
         if rule is None:
