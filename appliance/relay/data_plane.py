@@ -389,6 +389,7 @@ class DataPlane:
         if self._own.get(topic) is relayed.upstream:
             del self._own[topic]
         relayed.upstream.close()  # its remaining subscribers get nothing more
+        relayed.latch.forget()  # a stop, which outlives its publisher's connection
         self.interceptor.shadow.understand(relayed.point, "")
         self._ranks.withdraw(key, topic)
         self.interceptor.invalidate_prepared()  # its pipeline's counts are collected once more, and then freed
