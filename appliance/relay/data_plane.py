@@ -323,14 +323,17 @@ class DataPlane:
             self._link.go_on()
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
-        """Request the messages that monitors held back, on these topics only (None: all).
+        """Request the messages that monitors held back, and let monitors judge the kept ones.
 
-        On other topics, monitors would judge the same message twice.
+        This is for these topics only (None: all). On others, monitors would judge the same message twice.
         """
         for relayed in list(self.topics.values()):
-            concerned = topics is None or relayed.topic in topics
-            if concerned and relayed.lacks_latched:
+            if topics is not None and relayed.topic not in topics:
+                continue
+            if relayed.lacks_latched:
                 relayed.upstream.request_latched()
+            elif not self.interceptor.holds(relayed.topic):
+                relayed.judge_latched()
 
     def _release(self, message: messages.MonitorResumed | messages.RankFreed) -> None:
         if isinstance(message, messages.RankFreed):

@@ -453,11 +453,15 @@ class MonitorSet:
         )
 
     def replaced_topics(self, before: "MonitorSet | None") -> frozenset[str]:
-        """Return the topics of all monitors, in either set, that do not continue unchanged after `succeed`."""
+        """Return the topics of all monitors, in either set, that do not continue unchanged after `succeed`.
+
+        Those in shadow mode count if they have begun.
+        """
         earlier = before.monitors if before is not None else ()
         present = {monitor.name for monitor in self._monitors}  # `names` also has those in shadow mode
         kept = {monitor.name for monitor in earlier}.intersection(present) - set(self.began)
-        return self.topics_of(one for one in (*earlier, *self._monitors) if one.name not in kept)
+        tried = (one for one in self.shadowed if one.name in self.began)
+        return self.topics_of((*(one for one in (*earlier, *self._monitors) if one.name not in kept), *tried))
 
     # Changes
 
@@ -545,6 +549,11 @@ class MonitorSet:
         """Return the specifications with an enabled event on a topic."""
         steps = self.steps.get(topic, ())
         return list(dict.fromkeys(step.monitor.name for step in steps if not isinstance(step, Tap)))
+
+    def holds(self, topic: str) -> bool:
+        """Return whether a specification drops the messages of a topic because it cannot judge them now."""
+        monitors = (step.monitor for step in self.steps.get(topic, ()) if not isinstance(step, Tap))
+        return any(monitor.blocks and topic in monitor.held_channels for monitor in monitors)
 
     def unfit(self) -> str:
         """Return why one of the specifications that may stop, change or withhold messages cannot judge now, or an

@@ -547,6 +547,23 @@ class RelayedTopic:
     def lacks_latched(self) -> bool:
         return self.latch.is_lacking and not self._is_command
 
+    def judge_latched(self) -> None:
+        """Let monitors that have come into force judge the kept message, which its publisher sends only once.
+
+        Subscribers have it; later ones get what the monitors leave.
+        """
+        kept, through = self.latch.batch, self._monitoring.through
+        if kept is None or through is None or self._is_command or self._superseded:
+            return
+        one = Batch(memoryview(bytearray(kept.view)), 1, 0, owned=True)
+        one.first = self.counters.following - 1
+        left = self.latch.judge(one, through)
+        if left is not None:
+            self.latch.keep(left)
+        else:
+            self.latch.forget()
+            self.latch.withheld = True
+
     def upstream_closed(self, *, repeats: bool = False) -> None:
         """Note a lost connection. Keep the last message that passed if the publisher `repeats` it when it returns."""
         if self._rank is not None:

@@ -344,6 +344,10 @@ class Interceptor:
         """Return the monitors in force that judge or observe a topic."""
         return [] if self.monitors is None else self.monitors.judges(topic)
 
+    def holds(self, topic: str) -> bool:
+        """Return whether all messages of a topic are dropped now, whatever they are."""
+        return bool(self.blocked) or (self.monitors is not None and self.monitors.holds(topic))
+
     def has_stoppers(self, topic: str) -> bool:
         return self.monitors is not None and bool(self.monitors.stoppers(topic))
 

@@ -566,6 +566,47 @@ OFF: dict[str, Callable[[Monitored, str], object]] = {
 }
 
 
+OTHER_GUARD = GUARD.replace('"bad"', '"worse"')
+COMES: dict[str, tuple[Callable[[Monitored], object], Callable[[Monitored], object]]] = {
+    "loaded": (lambda world: world.load(), lambda world: world.load(GUARD, revision=2)),
+    "beside another": (
+        lambda world: world.load(OTHER_GUARD.replace("guard", "other")),
+        lambda world: world.load(OTHER_GUARD.replace("guard", "other"), GUARD, revision=2),
+    ),
+    "with another text": (
+        lambda world: world.load(BEGINNING.replace('"bad"', '"worse"')),
+        lambda world: world.load(BEGINNING, revision=2),
+    ),
+    "switched on": (
+        lambda world: world.load(GUARD, guard=False),
+        lambda world: world.state(MonitorSwitched("guard", True)),
+    ),
+    "out of shadow mode": (
+        lambda world: shadowed(world, OTHER_GUARD),
+        lambda world: world.load(GUARD, revision=3),
+    ),
+    "in shadow mode": (lambda world: world.load(), lambda world: shadowed(world, GUARD)),
+}
+
+
+@pytest.mark.parametrize("how", COMES)
+def test_a_monitor_that_begins_judges_the_latched_message_that_came_before(
+    world: Monitored, how: str
+) -> None:
+    """Its publisher sends the message only on a connection, and the relay has one already."""
+    before, comes = COMES[how]
+    before(world)
+    publisher, listener = latching_client(world, "/chatter")
+    publisher.send(string("bad"))
+    world.gets(listener, string("bad"))
+    world.told.clear()
+    comes(world)
+    world.event("shadow drop" if how == "in shadow mode" else "drop", monitor="guard")
+    publisher.send(string("new"))
+    world.gets(listener, string("new"))
+    assert not [one for one in world.told if isinstance(one, UpstreamWanted)]
+
+
 @pytest.mark.parametrize("off", OFF)
 @pytest.mark.parametrize(("topic", "safe"), [("/chatter", SAFE), ("/arm/goal", "int seen")])
 def test_a_command_that_a_guard_has_dropped_does_not_come_when_the_guard_is_off(
