@@ -550,10 +550,13 @@ class RelayedTopic:
     def judge_latched(self) -> None:
         """Let monitors that have come into force judge the kept message, which its publisher sends only once.
 
-        Subscribers have it; later ones get what the monitors leave.
+        Subscribers have it; later ones get what the monitors leave. A command is forgotten: it is not new.
         """
         kept, through = self.latch.batch, self._monitoring.through
-        if kept is None or through is None or self._is_command or self._superseded:
+        if kept is None or through is None or self._superseded:
+            return
+        if self._is_command:
+            self.latch.forget()
             return
         one = Batch(memoryview(bytearray(kept.view)), 1, 0, owned=True)
         one.first = self.counters.following - 1

@@ -607,6 +607,21 @@ def test_a_monitor_that_begins_judges_the_latched_message_that_came_before(
     assert not [one for one in world.told if isinstance(one, UpstreamWanted)]
 
 
+@pytest.mark.parametrize(("topic", "text"), [("/chatter", STOPPING), ("/arm/goal", BEGINNING)])
+def test_a_base_that_connects_gets_no_command_that_a_guard_has_not_judged(
+    world: Monitored, topic: str, text: str
+) -> None:
+    world.load()
+    publisher, base = latching_client(world, topic)
+    publisher.send(string("one"))
+    world.gets(base, string("one"))
+    world.load(text.replace("/chatter", topic), revision=2)
+    late = world.connect(encode_header(WANTED | {"topic": topic}))
+    world.gets_header(late)
+    publisher.send(string("new"))
+    world.gets(late, string("new"))
+
+
 @pytest.mark.parametrize("off", OFF)
 @pytest.mark.parametrize(("topic", "safe"), [("/chatter", SAFE), ("/arm/goal", "int seen")])
 def test_a_command_that_a_guard_has_dropped_does_not_come_when_the_guard_is_off(
