@@ -144,6 +144,15 @@ class RosMaster:
         while not self._open.is_set():  # the door may be shut again before this task runs
             await self._open.wait()
 
+    async def wait(self) -> bool:
+        """Wait for the open door, at most as long as a call does; return whether other code may have run."""
+        if self._open.is_set():
+            return False
+        with contextlib.suppress(CallFailedError):
+            async with self.patience():
+                await self.opened()
+        return True
+
     @contextlib.asynccontextmanager
     async def patience(self) -> AsyncIterator[None]:
         try:

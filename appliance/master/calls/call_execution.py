@@ -215,12 +215,13 @@ class Execution:
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
         """Wait until no other call writes these parameters; yield whether other code may have run.
 
-        A subscription also takes a turn, so its node misses no write after the value in the answer.
+        A subscription also takes a turn, so its node misses no write after the value in the answer. The wait for the
+        ROS master comes before the decision that counts.
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
         async with self._writes.alone(keys) as later, self.large_writes.turn(host, values) as large:
-            yield later or large
+            yield await self.parameters.rosmaster.wait() or later or large
 
     async def _carry_out(self, visit: ServedRequest, attempt: Attempt, decision: Decision) -> Value:
         policy, verb = self.policy(), attempt.call.verb

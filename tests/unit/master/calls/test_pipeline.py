@@ -136,6 +136,9 @@ class Site:
     def reachable(self) -> bool:
         return False
 
+    async def wait(self) -> bool:
+        return False
+
     async def call(self, method: str, *params: Any) -> Any:
         return (await self.call_in_order([(method, params)]))[0]
 
