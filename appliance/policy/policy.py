@@ -479,6 +479,13 @@ def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
     return replace(decision, told=told)
 
 
+def _extend(decision: Decision, addition: str) -> Decision:
+    """Add to the reason what names other hosts, which the caller may not learn."""
+    if len(decision.reason) + len(addition) > _LONGEST_REASON:
+        return decision
+    return replace(decision, reason=decision.reason + addition, told=decision.told or decision.reason)
+
+
 def _shorten(text: str, limit: int = 60) -> str:
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return shown if shown.isprintable() else quote(text, limit)

@@ -44,7 +44,7 @@ def phases_of(
 def _place(phase: tree.Name) -> int:
     name = phase.parts[0]
     if name not in NAMED:
-        text = f"there is no phase {quote(name)}{nearest(name, NAMED)}; there are {', '.join(NAMED)}"
+        text = f"there is no phase {quote(name)}{nearest(name, NAMED)}"
         raise SpecificationError.at(phase.position, text)
     return NAMED.index(name)
 

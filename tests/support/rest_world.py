@@ -101,6 +101,9 @@ class Tokens:
             for row in self.rows.values()
         ]
 
+    def ended(self) -> list[TokenKept]:
+        return []
+
     def usable_row(self, token_id: str) -> TokenRow | None:
         return self.rows.get(token_id)
 

@@ -87,7 +87,6 @@ class TokenOrders:
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 
     def ended(self) -> list[TokenKept]:
-        """Return the latest tokens that ended by themselves: the api tells their owners."""
         rows = [row for row in self._rows.values() if row.revoked is None and not self._is_usable(row)]
         latest = sorted(rows, key=lambda row: row.expires)[-_MAX_ENDED:]
         return [structs.replace(kept_by_api(row), ended=True) for row in latest]

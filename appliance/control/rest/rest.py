@@ -109,6 +109,9 @@ class RestTokens(UsableTokens, Protocol):
     def usable(self) -> list[TokenKept]:
         """Return the tokens that the api accepts."""
 
+    def ended(self) -> list[TokenKept]:
+        """Return the latest tokens that ended by themselves: the api tells their owners."""
+
     def used(self, token_id: str) -> None:
         """Note that a token was used."""
 

@@ -399,7 +399,7 @@ def keeps_state(text: str, names: Collection[str]) -> bool:
     """Whether a guard keeps its state when these parameters are set."""
     preset = preset_of(text)
     kinds = {preset.parameter(name).kind for name in names} if preset else set()
-    return kinds.isdisjoint({"joints", "time"})
+    return kinds.isdisjoint({"joints", "time", "entries"})
 
 
 def file_of(name: str, folder: Path) -> Path:

@@ -232,8 +232,8 @@ def set_values(
     within: Within = WITHIN,
     hold: Hold = False,
 ) -> None:
-    """Set parameters of a guard while it runs. It keeps its state, but starts again after a change of joint limits or
-    of a deadline.
+    """Set parameters of a guard while it runs. It keeps its state, but starts again after a change of joint limits,
+    of deadlines or of named entries.
 
     Example: rosrv guard set fence margin=0.5
     """

@@ -267,7 +267,7 @@ class Liveness:
             if not connected and now - max(since, incarnation.touched) >= self.settings.silent:
                 self._lose(incarnation, f"{why}, and it has no connection to a relay")
         elif refused or (not there and now - since >= self.settings.silent):
-            if incarnation.own and not refused:  # if refused, its process has ended and is started again already
+            if incarnation.own and not refused:  # one that refuses has ended, and is started again already
                 self.own_silent()
             self._lose(incarnation, why)
         elif there:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import close_ports, isolation
+from appliance.network import close_ports, interfaces, isolation
 from appliance.network.firewall.backend import RuleCounter
 from appliance.network.firewall.firewall_rules import (
     HOOKS,
@@ -136,7 +136,7 @@ def test_no_route_of_the_host_keeps_the_appliance_from_starting(
     routes: list[str], subnets: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     isolated = Isolation(Namespace.own(), SETTINGS)
-    monkeypatch.setattr(isolation.interfaces, "networks", lambda _namespace: routes)
+    monkeypatch.setattr(interfaces, "networks", lambda _namespace: routes)
     monkeypatch.setattr(isolated._forwarding, "has_ipv6", lambda: True)
     if subnets:
         isolated._choose_subnets()

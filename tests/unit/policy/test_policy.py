@@ -263,6 +263,16 @@ def test_a_blocked_host_learns_neither_operator_nor_note(tell: str, told: str) -
     assert text_for_caller(decision, "full") == decision.reason
 
 
+@pytest.mark.parametrize("line", ["take base = op ag", "rank base = op > ag"])
+def test_a_host_that_must_ask_learns_neither_holder_nor_rank(line: str) -> None:
+    text = "[Groups]\nop = 10.0.0.1\nag = 10.0.0.2\n[Publishers]\n/v = op, ask ag\n[Authority]\nbase = /v\n"
+    policy = replace(compiled(text + line), holders={"base": ipaddress.ip_address("10.0.0.1")})
+    decision = ask(policy, "10.0.0.2", Category.PUBLISH.value, "/v")
+    assert decision.asks
+    assert "while it" in text_for_caller(decision, "full")
+    assert not re.search(r"10\.0\.0\.1|\bop\b", text_for_caller(decision, "rule"))
+
+
 OWN = [ipaddress.ip_address(text) for text in ("192.168.1.2", "172.17.0.1", "fd00::2")]
 
 

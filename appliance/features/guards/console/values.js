@@ -42,7 +42,7 @@ export function SetValues({ guard, preset, seen, guards, close }) {
 function Outlook(/** @type {{tried: any, seen: Record<string, any[]>, loads: any[]}} */ { tried, seen, loads }) {
   const found = margins(tried, seen);
   const beyond = found.filter((one) => one.used >= 1);
-  const anew = loads.filter((one) => tried.origin !== "current" || one.kind === "joints" || one.kind === "time");
+  const anew = loads.filter((one) => tried.origin !== "current" || ["joints", "time", "entries"].includes(one.kind));
   const begins = anew.length > 0 && html`<p>With another value of ${anew.map((one) => one.name).join(", ")} the guard begins in its initial state.</p>`;
   if (!found.length) return html`<${Notice} title="Without messages to compare with">Watch the robot first, to see here what these values would have stopped. <code>rosrv guard set ${tried.name} VALUE=… --dry-run</code> compares with the last hour of the flight recorder.${begins}</${Notice}>`;
   return html`<${Notice} tone=${beyond.length ? "warn" : "allow"} role="status" title=${beyond.length ? "These values would have stopped the robot in the last minutes" : "These values would have stopped nothing in the last minutes"}><${Margins} margins=${found} />${begins}</${Notice}>`;

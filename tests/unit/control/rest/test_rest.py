@@ -74,6 +74,9 @@ class Everything:
     def usable(self) -> list[TokenKept]:
         return [kept(VIEWER), kept(ADMIN)]
 
+    def ended(self) -> list[TokenKept]:
+        return []
+
     def usable_row(self, token_id: str) -> TokenRow | None:
         return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
 

@@ -16,6 +16,7 @@ from appliance.features.guards.presets import (
     below_the_standard,
     description_of,
     head_of,
+    keeps_state,
     preset_of,
     text_of,
     topics_in,
@@ -30,6 +31,7 @@ from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.text.parser import parse
 from rosmop.text.tree import GivenValue
+from rosmop.types.given_lists import EXAMPLES
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import covering
 from tests.support.features.guards.guarded_robot import rows
@@ -51,6 +53,20 @@ def _fits(kinds: tuple[str, ...]) -> bool:
     """Whether the types are of one action: results of goals of another type answer nothing."""
     goal, result = kinds[0], kinds[-1]
     return not result.endswith("Result") or result == goal.replace("Goal", "Result")
+
+
+@pytest.mark.parametrize(
+    ("preset", "name"),
+    [(preset, one.name) for preset in PRESETS.values() for one in preset.parameters if one.loads],
+)
+def test_a_dry_run_says_whether_a_guard_keeps_its_state(preset: Preset, name: str) -> None:
+    text = text_of(Guard("guard", preset))
+    example = {**EXAMPLES, "time": "7s"}[preset.parameter(name).kind]
+    before = MonitorSet.of(compiled(text))
+    before.start(0)
+    after = MonitorSet.of(compiled(with_values(text, {name: example})))
+    after.succeed(before, 1)
+    assert keeps_state(text, {name}) is ("guard" not in after.began)
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
