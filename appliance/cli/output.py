@@ -49,7 +49,8 @@ def separate_data(context: "Context") -> None:
     for option in context.command.params:
         if not isinstance(option, TyperOption) or context.params.get(option.name or "") != STANDARD_OUTPUT:
             continue
-        name, verb = max(option.opts, key=len), context.command_path
+        name = max(option.opts, key=len)
+        verb = context.command_path.replace(str(context.find_root().info_name), "rosrv", 1)
         if OR_STANDARD not in (option.help or ""):
             raise usage_error(f"{name} - is not the name of a file: give one, such as {name} ./FILE", verb)
         if context.params.get("as_json"):
