@@ -1,9 +1,12 @@
 import itertools
+import os
+import signal
 
 import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession
+from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 ROLES = ["control", "relay", "rosmaster", "signer", "rosout"]
@@ -38,3 +41,10 @@ def test_kill(appliance: Appliance, ros: RosSession, role: str) -> None:
     assert ros.run("rosparam", "get", "/kept").stdout.strip() == role
     assert killed not in appliance.pids(role)
     assert {"/python_voice", "/cpp_voice", "/late_voice"} <= set(ros.run("rosnode", "list").stdout.split())
+
+
+def test_a_hanging_rosout_is_replaced(appliance: Appliance, ros: RosSession) -> None:
+    hanging = eventually(lambda: appliance.pids("rosout"), appliance.story)[0]
+    os.kill(hanging, signal.SIGSTOP)
+    eventually(lambda: set(appliance.pids("rosout")) - {hanging}, appliance.story)
+    eventually(lambda: "xmlrpc reply" in ros.run("rosnode", "ping", "-c1", "/rosout").stdout, appliance.story)
