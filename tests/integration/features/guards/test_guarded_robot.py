@@ -80,3 +80,17 @@ def test_a_large_scanner_stops_no_robot(own_appliance: Appliance, ros: RosSessio
     guards = [(row, row.guard()) for row in SCANNED if row.preset in {"separation", "zone"}]
     acts = [replace(act, within=math.inf) for act in FEW if act.name == "malformed"]
     survive(own_appliance, ros, guards, acts)
+
+
+def test_a_guard_hears_a_button_that_had_latched_before(own_appliance: Appliance, ros: RosSession) -> None:
+    command = ("rostopic", "echo", "-n", "1", "/cmd_vel/linear/x")
+    with ros:
+        for topic in ("/emergency_stop", "/emergency_stop_reset"):
+            ros.start(["rostopic", "pub", "--latch", topic, "std_msgs/Bool", "data: false"])
+            ros.run("rostopic", "echo", "-n", "1", topic)
+        ros.start(["rostopic", "echo", "/emergency_stop"])  # a display, which keeps the relay's connection
+        ros.start(["rostopic", "pub", "--rate", "20", "/cmd_vel", "geometry_msgs/Twist", "linear: {x: 0.2}"])
+        assert ros.run(*command).stdout.startswith("0.2")
+        own_appliance.rosrv("guard", "new", "estop", "/cmd_vel", "silent=0", "zeroFirst=false")
+        assert ros.run(*command).stdout.startswith("0.2")
+        own_appliance.rosrv("monitor", "remove", "estop")
