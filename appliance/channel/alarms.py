@@ -32,7 +32,7 @@ _CORE_KINDS = {
     "relay": AlarmKind("alarm", "read why it is away: its topics carry nothing"),
     "process-failing": AlarmKind("alarm", "read what it printed last"),
     "rosmaster": AlarmKind("warning", "wait: calls wait also"),
-    "token-ends": AlarmKind("warning", "rotate it, or revoke it if nobody needs it"),
+    "token-ends": AlarmKind("warning", "rotate it, or revoke it if it is not needed"),
     "audit-degraded": AlarmKind("warning", "check the disk, the load and the process signer"),
     "forgotten": AlarmKind("alarm", "enable the protection again, or remove it"),
     "monitor-off": AlarmKind("warning", "enable it again, unless it should be off"),

@@ -110,7 +110,7 @@ class RestTokens(UsableTokens, Protocol):
         """Return the tokens that the api accepts."""
 
     def ended(self) -> list[TokenKept]:
-        """Return the latest tokens that ended by themselves: the api tells their owners."""
+        """Return the latest tokens that have expired: the api tells their owners."""
 
     def used(self, token_id: str) -> None:
         """Note that a token was used."""

@@ -20,7 +20,7 @@ OFFER = sorted((one.verb, one.name) for one in OPTIONS if OR_STANDARD in one.hel
 def test_what_a_verb_writes_is_offered_on_standard_output() -> None:
     assert set(OFFER) <= set(WRITE)
     files_only = {verb for verb, name in set(WRITE) - set(OFFER) if name == "--output"}
-    # A folder, and files whose writers go back in them, or that are several.
+    # One is a folder, the others are several files, or their writers seek.
     assert files_only == {"standby join", "demo", "monitor run", "monitor learn"}
 
 

@@ -348,7 +348,7 @@ async def test_a_rotation_needs_room_only_for_a_further_token(
     assert sorted(one.name for one in tokens.usable()) == ["alice", "bob"]
 
 
-async def test_the_end_of_each_lasting_token_is_told_a_week_before(lives: Lives) -> None:
+async def test_a_warning_comes_a_week_before_each_lasting_token_ends(lives: Lives) -> None:
     day = 86_400.0
     with using(VirtualClock()):
         tokens = lives.next()
@@ -364,7 +364,7 @@ async def test_the_end_of_each_lasting_token_is_told_a_week_before(lives: Lives)
         assert tokens.ending() == []
 
 
-async def test_only_what_ended_by_itself_is_called_ended(lives: Lives) -> None:
+async def test_only_expired_tokens_are_called_ended(lives: Lives) -> None:
     with using(VirtualClock()):
         tokens = lives.next()
         for name in ("alice", "bob", "carol"):
