@@ -17,7 +17,7 @@ WRITE = sorted(
 OFFER = sorted((one.verb, one.name) for one in OPTIONS if OR_STANDARD in one.help)
 
 
-def test_what_a_verb_writes_is_offered_on_standard_output() -> None:
+def test_each_verb_offers_standard_output_for_its_file() -> None:
     assert set(OFFER) <= set(WRITE)
     files_only = {verb for verb, name in set(WRITE) - set(OFFER) if name == "--output"}
     # One is a folder, the others are several files, or their writers seek.
