@@ -185,6 +185,11 @@ def _check_ranked(group: AuthorityGroup, options: list[tuple[str, str, Entry]], 
 
 
 def _read_rank(entry: Entry, groups: HostGroups, findings: Findings) -> tuple[tuple[RankMember, ...], ...]:
+    if time := groups.first_time(entry.values):
+        findings.error(
+            time, "ranks have no times: put the host with its time into [Groups], and the group here"
+        )
+        return ()
     ranks: list[list[RankMember]] = [[]]
     for word in entry.values:
         if word.text == _HIGHER:

@@ -92,6 +92,10 @@ class HostGroups:
     def units(self, words: Sequence[Word]) -> list[tuple[Word, ...]]:
         return host_units(words, self.groups)
 
+    def first_time(self, words: Sequence[Word]) -> Word | None:
+        """Return the first word that limits a host in time, for lines that have no times."""
+        return next((unit[1] for unit in self.units(words) if len(unit) > 1), None)
+
     def read(self, words: Sequence[Word]) -> tuple[tuple[str, Atom], ...]:
         atoms: dict[Atom, str] = {}
         for unit in self.units(words):

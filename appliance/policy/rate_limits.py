@@ -164,8 +164,8 @@ def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Finding
         text = "topic limits all publishers together: name no hosts, or limit each publisher there"
         findings.error(hosts[0], text)
         return None
-    if timed := next((unit for unit in groups.units(hosts) if len(unit) > 1), None):
-        findings.error(timed[1], "limits have no times: they hold at any hour")
+    if time := groups.first_time(hosts):
+        findings.error(time, "limits have no times: they hold at any hour")
         return None
     atoms = frozenset(atom for _, atom in groups.read(hosts)) if hosts else None
     return Clause(LimitScope(part.text), atoms, rate)
