@@ -119,8 +119,14 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 def _await_objection(connection: socket.socket) -> None:
     """Wait for the server's rejection of our certificate, which in TLS 1.3 comes after our handshake."""
-    select.select([connection], [], [], _OBJECTION_SECONDS)
+    _is_readable(connection, _OBJECTION_SECONDS)
     _require_open(connection)
+
+
+def _is_readable(connection: socket.socket, seconds: float) -> bool:
+    poll = select.poll()  # `select` takes no descriptor above 1023
+    poll.register(connection, select.POLLIN)
+    return bool(poll.poll(seconds * 1000))
 
 
 def _require_open(connection: socket.socket) -> None:
@@ -139,8 +145,7 @@ def _await_acknowledgement(connection: socket.socket) -> None:
     while _unacknowledged(connection):
         if clock.now() > deadline:
             raise TimeoutError(f"the receiver took nothing for {_SEND_SECONDS:g} s")
-        readable, _, _ = select.select([connection], [], [], pause)
-        if readable:
+        if _is_readable(connection, pause):
             _require_open(connection)
         pause = min(2 * pause, longest)
 

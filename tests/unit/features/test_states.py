@@ -12,7 +12,7 @@ AUDIT = "lag_records lag_seconds failed on_failure degraded replaced forwarding 
 STATUS = (
     "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
     " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
-    " name standby bundles doors adopt handled_alarms starting new_state approvals guards authority"
+    " name standby bundles doors adopt handled_alarms starting new_state tokens_ending now approvals guards authority"
 )
 TO: dict[str, Any] = {"to": "tls://log:6514", "behind": 7}
 DOOR = {
