@@ -117,6 +117,8 @@ class ComparedRelay(Monitored):
         if topic not in self.publishers:
             self.publish(topic)
         self.gets_header(peer)
+        # A buffer of a fixed size: the kernel enlarges others by time, and what does not fit is dropped.
+        peer.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
         self.subscribers[name] = peer
 
     def arrived(self, topic: str) -> bool:
@@ -341,9 +343,8 @@ class PumpComparison:
         common = min(len(one), len(other))
         if one[:common] != other[:common]:
             at = next(at for at in range(common) if one[at] != other[at])
-            raise AssertionError(
-                f"{name} gets {one[at - 40 : at + 40]!r} by the pump, {other[at - 40 : at + 40]!r} without"
-            )
+            part = slice(max(0, at - 40), at + 40)
+            raise AssertionError(f"{name} gets {one[part]!r} by the pump, {other[part]!r} without")
         self.done["bytes compared"] += common
         del one[:common], other[:common]
 
